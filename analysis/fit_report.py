@@ -82,7 +82,7 @@ def read_plant(file: str) -> Plant:
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError  # type: ignore[import-untyped]
+    from yaml import YAMLError  # type: ignore[import-untyped]  # which has no types
 
     source = given_path(file, "the file of a plant", AnalysisError)
     try:

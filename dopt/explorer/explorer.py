@@ -214,7 +214,7 @@ class Explorer(SavedExplored):
             raise
 
     def _begin(self, spec: TrialSpec, deadline: float | None) -> None:
-        """Begin an exploration, or go on with that of the journal."""
+        """Begin an exploration, or go on with the one in the journal."""
         system = spec.system
         measured_states = list(system.measured_states or range(system.n_states))
         self._angles = [i for i, row in enumerate(measured_states) if row in system.angle_indices]

@@ -19,7 +19,7 @@ def save(found: Any, path: str | Path) -> None:
 
     ``docs/example/load_model.py`` reads it with NumPy alone.
     """
-    model, p = found._chosen.model, found._chosen.solution.p
+    model, p = found.chosen.model, found.chosen.solution.p
     values, s, plant = model.values(p), model.structure, found.plant
     w, n, r = model.width, len(s.feature_kinds), len(s.learned)
     weights = values.weights
@@ -53,7 +53,7 @@ def to_torch(found: Any) -> Any:
     """Return a module that gives dx/dt, (..., d), at x, (..., d), and u, (..., m), which acts."""
     import torch
 
-    model, p = found._chosen.model, found._chosen.solution.p
+    model, p = found.chosen.model, found.chosen.solution.p
     values, s = model.values(p), model.structure
     w, n, r = model.width, len(s.feature_kinds), len(s.learned)
 
@@ -109,9 +109,9 @@ def environment(found: Any) -> Any:
             "pip install gymnasium."
         ) from error
 
-    model, p = found._chosen.model, found._chosen.solution.p
+    model, p = found.chosen.model, found.chosen.solution.p
     values, plant = model.values(p), found.plant
-    starts = found._chosen.solution.windows.starts
+    starts = found.chosen.solution.windows.starts
     bound = min(plant.gamma, plant.supply)
 
     class FittedPlant(gymnasium.Env):  # type: ignore[misc]  # of a library that may lack

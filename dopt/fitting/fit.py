@@ -26,11 +26,17 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of, measured_names
-from dopt.fitting.predictions import HORIZONS, Predicted, linear_predictions, predicted
+from dopt.fitting.predictions import (
+    HORIZONS,
+    Predicted,
+    linear_predictions,
+    predicted,
+    prediction_rows,
+)
 from dopt.fitting.problem import Simulator, Solution, Windows, first_states, solve, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log
-from dopt.systems.plant import Encoder, Plant, Unknown
+from dopt.systems.plant import Encoder, Plant, Unknown, first_guess
 from dopt.types import Array, Integers
 
 BLOCKS = 5
@@ -82,17 +88,17 @@ def fit(
     Parameters
     ----------
     plant : Plant
-        With :func:`dopt.unknown` constants, delay or lag. Its ``learned`` rows get a network.
+        With :func:`dopt.unknown` constants, delay or lag. Its ``learned`` rows get a network. An
+        unknown delay begins at the sample that fits best, and is free by a sample or so.
     logs : Log, DataFrame, mapping or sequence of them
         Recorded runs (:class:`dopt.Log`); a table is read with the names of the plant.
     validate : the same, optional
-        Other runs, on which the report's errors are taken; without them they are those of
-        held-out blocks.
+        Other runs, on which the report's errors are taken, in place of held-out blocks.
     width : int
         Units of the network that is tried; 0 for none.
     hold : {"zero", "linear"}
-        What an input is between two rows: that of the first one, as a controller holds it, or
-        interpolated, where it was measured.
+        Between two rows an input is as in the first one, as a controller holds it, or interpolated,
+        where it was measured.
     window : float, optional
         Length of the windows [s], instead of one that is chosen.
     weights : sequence of float
@@ -112,6 +118,12 @@ def fit(
     """
     runs, tests = _logs(plant, logs), [] if validate is None else _logs(plant, validate)
     _check(width, weights, workers)
+    unknown = [*plant.constants.values(), plant.delay, plant.lag]
+    if not (width or any(isinstance(value, Unknown) for value in unknown)):
+        raise SpecificationError(
+            "the plant has no unknown constant, delay or lag and the network has no units, but "
+            "something to fit is expected: declare one with dopt.unknown(), or give a width."
+        )
     plant = _measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
@@ -137,8 +149,8 @@ class _Selection:
         say: Callable[[str], None],
     ) -> None:
         self.plant, self.data, self.blocks, self.say = plant, data, blocks, say
-        self.workers = workers
-        self.delay = plant.delay.value if isinstance(plant.delay, Unknown) else plant.delay
+        self.workers, self._all_blocks = workers, blocks
+        self.delay = first_guess(plant.delay)
         self.model = self._model(self.delay, free=True)
         self.step = float(np.median(_steps(data)))
         self.scale = time_scale(data)
@@ -194,25 +206,21 @@ class _Selection:
                 spans.append(float(data.time[ends[1]] - data.time[ends[0]]))
         return max(spans)
 
-    def _windows(self, seconds: float, block: int | None = None) -> Windows:
-        """Return the windows of one block, or of all."""
-        chosen = range(len(self.blocks)) if block is None else [block]
+    def _windows(self, seconds: float) -> Windows:
+        """Return windows of all blocks, none over a border; also of blocks that judge nothing."""
+        skip, ahead = self._latest(), 2.0 * self.step
         rows = np.concatenate(
             [
-                windows_of(
-                    *(self.data, *self.blocks[i], seconds),
-                    skip=self._latest(),
-                    ahead=2.0 * self.step,
-                )
-                for i in chosen
+                windows_of(self.data, *block, seconds, skip=skip, ahead=ahead)
+                for block in self._all_blocks
             ]
         )
         return Windows(rows, first_states(self.data, self.model, rows))
 
     def _latest(self) -> float:
         """Return the longest time from an input to its effect that is tried [s]."""
-        lag = self.plant.lag.value if isinstance(self.plant.lag, Unknown) else self.plant.lag
-        return max(self.delay, 0.0) + max(SCANNED) * self.step + 3.0 * lag
+        latest = max(self.delay, 0.0) + max(SCANNED) * self.step
+        return latest + 3.0 * first_guess(self.plant.lag)
 
     def scan_delay(self, seconds: float) -> None:
         """Fit the constants to some windows with each delay, and begin from the best one."""
@@ -355,18 +363,12 @@ class _Selection:
     def _tested(self, seconds: float, block: int, horizon: float | None = None) -> Integers:
         """Return first row, last row of the history, and last row of held-out predictions."""
         horizon = seconds if horizon is None else horizon
-        rows = windows_of(
-            *(self.data, *self.blocks[block], 0.5 * seconds + horizon),
+        rows = prediction_rows(
+            *(self.data, self.blocks[block], 0.5 * seconds, horizon),
             skip=self._latest(),
             ahead=2.0 * self.step,
         )
-        rows = rows[:: max(1, len(rows) // MOST_VALIDATED)]
-        ends = self.data.time[rows[:, 0]] + 0.5 * seconds
-        history = [
-            first + int(np.searchsorted(self.data.time[first : last + 1], end))
-            for (first, last), end in zip(rows, ends, strict=True)
-        ]
-        return np.array([(a, h, b) for (a, b), h in zip(rows, history, strict=True)]).reshape(-1, 3)
+        return rows[:: max(1, len(rows) // MOST_VALIDATED)]
 
     def _validate(self, model: Model, whole: Solution, s: float) -> tuple[Array, list[Array]]:
         """Return for each block how a fit to the others predicts it, and its parameters.
@@ -398,12 +400,8 @@ class _Selection:
 
     def held_out(self) -> dict[str, list[Predicted]]:
         """Return predictions of each block up to the longest horizon, by what made them."""
-        longest = max(HORIZONS) * self.window
-        pieces = max(self.data.time[b] - self.data.time[a] for a, b in self.blocks)
-        tested = [
-            self._tested(self.window, block, min(longest, 0.5 * pieces))
-            for block in range(len(self.blocks))
-        ]
+        longest = min(max(HORIZONS) * self.window, 0.5 * self._longest_block())
+        tested = [self._tested(self.window, block, longest) for block in range(len(self.blocks))]
         out: dict[str, list[Predicted]] = {}
         for what, (model, folds) in self._folds.items():
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,11 +15,13 @@ from dopt.fitting.model import Model, data_of, measured_names
 from dopt.fitting.predictions import (
     HORIZONS,
     Predicted,
+    errors_ahead,
     horizon_errors,
     linear_predictions,
     predicted,
+    prediction_rows,
 )
-from dopt.fitting.problem import Simulator, Solution, Windows, first_states, windows_of
+from dopt.fitting.problem import Simulator, Solution, Windows, first_states
 from dopt.fitting.simulation import Data
 from dopt.log import Log
 from dopt.systems.plant import Plant, Unknown
@@ -76,6 +77,10 @@ class Fitted:
         fit without a network.
     has_network : bool
         Whether validation wanted one.
+    chosen, physics : Estimate
+        What was chosen, and the fit of the constants without a network; the same if it was refused.
+    data : Data
+        Rows of all logs, and the standard deviations of what the constants leave.
     """
 
     def __init__(
@@ -90,13 +95,13 @@ class Fitted:
         tests: Sequence[Log],
     ) -> None:
         self.plant, self.hold, self.selection, self.tests = plant, hold, selection, list(tests)
-        self._data, self._chosen, self._physics = data, chosen, physics
+        self.data, self.chosen, self.physics = data, chosen, physics
         self._held_out = dict(held_out)
         self.has_network = chosen is not physics
 
     @functools.cached_property
     def constants(self) -> dict[str, tuple[float, float]]:
-        model, solution, _, covariance = self._physics
+        model, solution, _, covariance = self.physics
         values, slopes = model.named_values(solution.p)
         deviations = np.abs(slopes) * np.sqrt(np.diag(covariance)[model.named])
         return {
@@ -119,25 +124,25 @@ class Fitted:
     @property
     def delay(self) -> float:
         """Time from an input to its effect in the chosen model [s]."""
-        return float(self._chosen.model.values(self._chosen.solution.p).delay)
+        return float(self.chosen.model.values(self.chosen.solution.p).delay)
 
     @property
     def noise(self) -> dict[str, float]:
         """Standard deviation of what the model leaves of each measured state, in its unit."""
         names = measured_names(self.plant)
-        return dict(zip(names, map(float, self._data.deviations), strict=True))
+        return dict(zip(names, map(float, self.data.deviations), strict=True))
 
     def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike) -> Array:
         """Return dx/dt, (N, d), at states, (N, d), under inputs that act there, (N, m)."""
         x = np.atleast_2d(np.asarray(states, float))
         u = np.atleast_2d(np.asarray(inputs, float))
-        d, m = self._chosen.model.d, self._chosen.model.m
+        d, m = self.chosen.model.d, self.chosen.model.m
         if x.ndim != 2 or x.shape[1] != d or u.shape != (len(x), m):
             raise SpecificationError(
                 f"states of shape {x.shape} and inputs of shape {u.shape} were given, but (N, {d}) "
                 f"and (N, {m}) are expected: correct them."
             )
-        return self._chosen.model.derivative(self._chosen.solution.p, x, u)
+        return self.chosen.model.derivative(self.chosen.solution.p, x, u)
 
     def simulate(
         self, run: Any, *, history: float | None = None, level: float = 0.9
@@ -166,7 +171,7 @@ class Fitted:
                 f"0.9."
             )
         data, z = self._with(run), float(norm.ppf(0.5 + 0.5 * level))
-        model, solution, _, covariance = self._chosen
+        model, solution, _, covariance = self.chosen
         simulator = Simulator(model, data)
         seconds = 0.5 * self.selection.window if history is None else float(history)
         out = []
@@ -185,20 +190,11 @@ class Fitted:
             variance += np.square(
                 self.errors_ahead(data.time[first : last + 1] - data.time[middle])
             )
-            half, seen = (
-                z * np.sqrt(variance),
-                np.isfinite(data.measured[first : last + 1]).any(axis=1),
-            )
-            seen |= self.hold == "zero"
-            middle_states = states[:, measured]
-            out.append(
-                Simulation(
-                    data.time[first : last + 1][seen],
-                    states[seen],
-                    (middle_states - half)[seen],
-                    (middle_states + half)[seen],
-                )
-            )
+            low, high = (states[:, measured] + side * np.sqrt(variance) for side in (-z, z))
+            recorded = np.isfinite(data.measured[first : last + 1]).any(axis=1)
+            recorded |= self.hold == "zero"  # a linear hold adds rows
+            parts = (data.time[first : last + 1], states, low, high)
+            out.append(Simulation(*(part[recorded] for part in parts)))
         return out
 
     def errors_ahead(self, seconds: Array) -> Array:
@@ -206,14 +202,8 @@ class Fitted:
 
         Before the first horizon they are the noise, and beyond the last one they stay.
         """
-        rows = horizon_errors(self._held_out["model"], self.horizons)
-        times = [0.0, *(row[0].horizon for row in rows)]
-        noise = self._data.deviations
-        out = np.empty((len(seconds), len(noise)))
-        for c, deviation in enumerate(noise):
-            found = [deviation, *(max(row[c].rms, deviation) for row in rows)]
-            out[:, c] = np.interp(seconds, times, found)
-        return out
+        found, noise = self._held_out["model"], self.data.deviations
+        return errors_ahead(found, self.horizons, seconds, noise)
 
     @property
     def horizons(self) -> list[float]:
@@ -235,33 +225,21 @@ class Fitted:
         ]
 
     def _tested(self) -> dict[str, list[Predicted]]:
-        data = data_of(self.plant, self.tests, self.hold, self._data.deviations)
-        rows = self._windows(data, max(self.horizons))
-        models = {"model": self._chosen, "physics alone": self._physics}
+        data = data_of(self.plant, self.tests, self.hold, self.data.deviations)
+        history = 0.5 * self.selection.window
+        rows = prediction_rows(
+            *(data, (0, len(data.time) - 1), history, max(self.horizons)),
+            skip=self._latest(),
+            ahead=2.0 * self.plant.dt,
+        )
+        models = {"model": self.chosen, "physics alone": self.physics}
         found = {
             what: [predicted(Simulator(each.model, data), each.solution.p, rows)]
             for what, each in models.items()
         }
         step = float(np.median(np.diff(self.tests[0].pieces[0].time)))
-        found["linear"] = [linear_predictions(self._data, data, rows, self.delay, step)]
+        found["linear"] = [linear_predictions(self.data, data, rows, self.delay, step)]
         return found
-
-    def _windows(self, data: Data, horizon: float) -> Integers:
-        """Return windows of a history and a horizon, (k, 3), one after the other."""
-        history = 0.5 * self.selection.window
-        rows = windows_of(
-            *(data, 0, len(data.time) - 1, history + horizon),
-            skip=self._latest(),
-            ahead=2.0 * self.plant.dt,
-        )
-        ends = data.time[rows[:, 0]] + history
-        middles = [
-            first + int(np.searchsorted(data.time[first : last + 1], end))
-            for (first, last), end in zip(rows, ends, strict=True)
-        ]
-        return np.array(
-            [(a, h, b) for (a, b), h in zip(rows, middles, strict=True)], np.int64
-        ).reshape(-1, 3)
 
     def coverage(self, level: float = 0.9) -> dict[str, float]:
         """Return the share of held-out measurements within the bounds of predictions at a level.
@@ -271,21 +249,16 @@ class Fitted:
         from scipy.stats import norm
 
         z, parts = float(norm.ppf(0.5 + 0.5 * level)), self._held_out["model"]
-        inside: list[Array] = []
+        held = np.zeros((2, len(self.data.deviations)))  # inside, and all
         for i, part in enumerate(parts):
-            rows = horizon_errors([each for j, each in enumerate(parts) if j != i], self.horizons)
-            times = [0.0, *(row[0].horizon for row in rows)]
+            others = [each for j, each in enumerate(parts) if j != i]
             for seconds, error, change in zip(part.seconds, part.errors, part.changes, strict=True):
-                for c, deviation in enumerate(self._data.deviations):
-                    found = [deviation, *(max(row[c].rms, deviation) for row in rows)]
-                    bound = z * np.interp(seconds, times, found)
-                    held = (np.abs(error[:, c]) <= bound)[np.isfinite(change[:, c])]
-                    inside.append(np.column_stack([np.full(len(held), c), held]))
-        both = np.concatenate(inside) if inside else np.zeros((0, 2))
-        return {
-            name: float(both[both[:, 0] == c, 1].mean()) if (both[:, 0] == c).any() else math.nan
-            for c, name in enumerate(measured_names(self.plant))
-        }
+                bound = z * errors_ahead(others, self.horizons, seconds, self.data.deviations)
+                seen = np.isfinite(change)
+                held += (seen & (np.abs(error) <= bound)).sum(axis=0), seen.sum(axis=0)
+        with np.errstate(invalid="ignore"):
+            shares = held[0] / held[1]
+        return dict(zip(self.noise, shares.tolist(), strict=True))
 
     def whiteness(self) -> dict[str, tuple[float, float]]:
         """Return two correlations of the residuals of each measured state.
@@ -293,8 +266,8 @@ class Fitted:
         The first is with the residual one row before, the second the largest one with one of the
         last ten inputs; 0 of a model that leaves nothing but white noise.
         """
-        model, solution, _, _ = self._chosen
-        simulator, data = Simulator(model, self._data), self._data
+        model, solution, _, _ = self.chosen
+        simulator, data = Simulator(model, self.data), self.data
         out = {}
         for c, name in enumerate(measured_names(self.plant)):
             now, before, rows = [], [], []
@@ -357,7 +330,7 @@ class Fitted:
 
     def _with(self, run: Any) -> Data:
         log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
-        return data_of(self.plant, [log], self.hold, self._data.deviations)
+        return data_of(self.plant, [log], self.hold, self.data.deviations)
 
     def _whole(self, data: Data, history: float) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""
@@ -379,7 +352,7 @@ class Fitted:
         return np.array(out, np.int64)
 
     def _latest(self) -> float:
-        values = self._chosen.model.values(self._chosen.solution.p)
+        values = self.chosen.model.values(self.chosen.solution.p)
         return max(values.delay, 0.0) + 3.0 * values.lag
 
     def free_run_error(self, run: Any, *, history: float | None = None) -> dict[str, float]:
@@ -387,7 +360,7 @@ class Fitted:
         data = self._with(run)
         seconds = 0.5 * self.selection.window if history is None else float(history)
         rows = self._whole(data, seconds)
-        found = predicted(Simulator(self._chosen.model, data), self._chosen.solution.p, rows)
+        found = predicted(Simulator(self.chosen.model, data), self.chosen.solution.p, rows)
         errors = np.concatenate(found.errors)
         squares = [np.mean(np.square(column[~np.isnan(column)])) for column in errors.T]
         names = measured_names(self.plant)

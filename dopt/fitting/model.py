@@ -16,7 +16,8 @@ from dopt.kernel.compiler import compilable
 from dopt.kernel.equations import KNOWN, as_tuple
 from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
-from dopt.systems.plant import Encoder, Plant, Unknown, compiled_text
+from dopt.systems.expressions import compiled_text
+from dopt.systems.plant import Encoder, Plant, Unknown
 from dopt.types import Array, CompiledFunction, Equation
 
 _KINDS = {"identity": 0, "cos": 1, "sin": 2}

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dopt.fitting.problem import Simulator, Windows, first_states
+from dopt.fitting.problem import Simulator, Windows, first_states, windows_of
 from dopt.fitting.simulation import Data
 from dopt.types import Array, Integers
 
@@ -84,6 +84,28 @@ def predicted(simulator: Simulator, p: Array, rows: Integers) -> Predicted:
     return Predicted(seconds, errors, changes, data.deviations)
 
 
+def prediction_rows(
+    data: Data,
+    rows: tuple[int, int],
+    history: float,
+    horizon: float,
+    *,
+    skip: float,
+    ahead: float,
+) -> Integers:
+    """Return windows within first and last rows, (k, 3), as :func:`predicted` takes them.
+
+    Each has a history and a horizon [s]; ``skip`` and ``ahead`` are as in
+    :func:`dopt.fitting.problem.windows_of`.
+    """
+    windows = windows_of(data, *rows, history + horizon, skip=skip, ahead=ahead)
+    out = [
+        (first, first + np.searchsorted(data.time[first:last], data.time[first] + history), last)
+        for first, last in windows
+    ]
+    return np.array(out, np.int64).reshape(-1, 3)
+
+
 class HorizonError(NamedTuple):
     """Error of predictions so far ahead, over several windows, for one measured state."""
 
@@ -113,6 +135,23 @@ def horizon_errors(
                 HorizonError(horizon, rms, float(np.median(np.abs(error))), moved, len(error))
             )
         out.append(row)
+    return out
+
+
+def errors_ahead(
+    found: Sequence[Predicted], horizons: Sequence[float], seconds: Array, noise: Array
+) -> Array:
+    """Return the root mean square errors of predictions so far ahead [s], (N, n).
+
+    They are interpolated between the horizons; at 0 they are the noise, (n,), below which they do
+    not fall, and beyond the last horizon they stay.
+    """
+    rows = horizon_errors(found, horizons)
+    times = [0.0, *(row[0].horizon for row in rows)]
+    out = np.empty((len(seconds), len(noise)))
+    for c, deviation in enumerate(noise):
+        errors = [deviation, *(max(row[c].rms, deviation) for row in rows)]
+        out[:, c] = np.interp(seconds, times, errors)
     return out
 
 

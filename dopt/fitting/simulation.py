@@ -108,7 +108,7 @@ class Data(NamedTuple):
     """Rows of all logs, piece after piece."""
 
     time: Vector  # (N,)
-    measured: Matrix  # (N, n), NaN where there is none
+    measured: Matrix  # (N, n), NaN where nothing was measured
     inputs: Matrix  # (N, m)
     firsts: Integers  # (N,) first row of the piece of each row
     lasts: Integers  # (N,) last row of it

@@ -4,11 +4,12 @@ A state has the half-width of the box, and an angle 1 rad. The size of another o
 rate makes of the others within ``STEPS_ACROSS`` steps, or what makes that much of another one.
 
 A learned state is divided by what it changes by in a second when it crosses its size in
-``STEPS_ACROSS`` steps: then that acceleration is 1, and those of plants are of the order of the
-outputs of a network. If a unit is another one by some factor its sizes are so, and where that is a
-power of two they are so bit for bit. Other factors are rounded, by some 1e-16, which learners that
-solve for all parameters at once amplify a million million times: so scaled numbers are rounded to
-36 bits, after which most of them are the same ones in all units. Angles have one unit and are not.
+``STEPS_ACROSS`` steps: then that acceleration is 1, and accelerations of plants are of the order
+of the outputs of a network. If a unit is another one by some factor its sizes are so, and where
+that is a power of two they are so bit for bit. Other factors are rounded, by some 1e-16, which
+learners that solve for all parameters at once amplify a million million times: so scaled numbers
+are rounded to 36 bits, after which most of them are the same ones in all units. Angles have one
+unit and are not.
 """
 
 from __future__ import annotations

@@ -122,8 +122,8 @@ def folds(
 def judged(case: Case, name: str, given: Sequence[Log], left_out: Log, workers: int) -> Fold:
     """Fit a plant to logs, and return the errors on another one, also of the reference."""
     fitted = fit(case.plant, given, workers=workers, **case.options)
-    own, alone = fitted._chosen, fitted._physics
-    data = data_of(case.plant, [left_out], fitted.hold, fitted._data.deviations)
+    own, alone = fitted.chosen, fitted.physics
+    data = data_of(case.plant, [left_out], fitted.hold, fitted.data.deviations)
     rows = windows(case, data)
     ours = _errors(case, Simulator(own.model, data), own.solution.p, rows)
     if case.reference is None:

@@ -195,3 +195,22 @@ def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) 
     given = {"logs": run(0, 60), "width": 0} | arguments
     with pytest.raises(SpecificationError, match=said):
         dopt.fit(declared(), **given)  # type: ignore[arg-type]
+
+
+def test_a_plant_without_unknowns_gets_a_network_alone() -> None:
+    known = dict(zip(("gain", "damping", "gravity", "offset"), TRUE, strict=True))
+    found = dopt.fit(
+        declared(constants=known, delay=0.02), run(1, drag=0.4), width=4, weights=(10.0,)
+    )
+    assert found.constants == {}
+    assert found.has_network
+    with pytest.raises(SpecificationError, match="something to fit is expected"):
+        dopt.fit(declared(constants=known, delay=0.02), run(1), width=0)
+
+
+def test_a_block_that_judges_nothing_is_fitted_to_all_the_same() -> None:
+    """The last run of four is too short to be predicted."""
+    tables = [run(seed) for seed in range(3)] + [run(3)[:45]]
+    found = dopt.fit(declared(), tables, width=0, window=0.7)
+    first_rows = found.chosen.solution.windows.rows[:, 0]
+    assert (first_rows >= sum(map(len, tables[:3]))).any()

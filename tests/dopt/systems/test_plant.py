@@ -18,7 +18,7 @@ from dopt.assessment import true_parameters
 from dopt.errors import SpecificationError
 from dopt.kernel.equations import compiled_equations
 from dopt.systems import SYSTEMS, Chain, System, system_from_mapping
-from dopt.systems.plant import compiled_text
+from dopt.systems.expressions import compiled_text
 from tests.dopt.explorer.plants import MOTOR
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems, vectors
 
