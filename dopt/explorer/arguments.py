@@ -30,9 +30,10 @@ def instance(what: str, given: object, kinds: type | UnionType, expected: str) -
 def whole(what: str, given: object, lower: int = -LARGEST_WHOLE, upper: int = LARGEST_WHOLE) -> int:
     """Return a whole number within bounds, or raise SpecificationError."""
     if not _is_real(given, "iu") or not lower <= int(given) <= upper:  # type: ignore[call-overload]
+        least = f" of at least {lower}" if lower > -LARGEST_WHOLE else ""
+        bounds = f" from {lower} to {upper:,}" if upper < LARGEST_WHOLE else least
         raise SpecificationError(
-            f"{what} is {given!r}, but a whole number"
-            f"{f' from {lower} to {upper:,}' if lower > 0 else ''} is expected: correct it."
+            f"{what} is {given!r}, but a whole number{bounds} is expected: correct it."
         )
     return int(given)  # type: ignore[call-overload,no-any-return]
 

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from dopt.errors import SpecificationError
+from dopt.explorer.arguments import instance, whole
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of, measured_names
 from dopt.fitting.predictions import (
@@ -116,6 +117,7 @@ def fit(
     SpecificationError
         If nothing is to be fitted, or the logs do not fit the plant or are too short.
     """
+    instance("plant", plant, Plant, "a dopt.Plant")
     runs, tests = _logs(plant, logs), [] if validate is None else _logs(plant, validate)
     _check(width, weights, workers)
     unknown = [*plant.constants.values(), plant.delay, plant.lag]
@@ -529,12 +531,8 @@ def _measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
 
 
 def _check(width: int, weights: Sequence[float], workers: int) -> None:
-    for what, value, least in (("width", width, 0), ("workers", workers, 1)):
-        if value != int(value) or value < least:
-            raise SpecificationError(
-                f"{what} is {value!r}, but a whole number of at least {least} is expected: "
-                f"correct it."
-            )
+    whole("width", width, 0)
+    whole("workers", workers, 1)
     if width and not (len(weights) and all(np.isfinite(w) and w > 0 for w in weights)):
         raise SpecificationError(
             f"weights is {weights!r}, but positive numbers are expected: give for instance "

@@ -51,7 +51,8 @@ def reject_unknown(config: DictConfig) -> None:
     for key in set(map(str, config)) - {*KNOWN, "hydra"}:
         own = [name for name in map(str, config) if name != "hydra"]
         reference = re.compile(rf"\$\{{[^{{}}]*\b{re.escape(key)}\b")
-        if not any(reference.search(text) for _, text in _interpolations(config, own)):
+        texts = (_ENVIRONMENT.sub("", text) for _, text in _interpolations(config, own))
+        if not any(map(reference.search, texts)):
             raise unknown_name("setting", key, KNOWN)
 
 

@@ -54,6 +54,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "width=8,wide"], "model.width is 'wide' .* a whole number is expected"),
         (["env.mass=-1"], "env.mass is -1.0 kg, but it has to be finite and above 0"),
         (["+env.colour=red"], "'colour' is unknown"),
+        (["+results=x"], "setting 'results' is unknown"),  # a word in the usual URL of the store
         (["seed=-1"], "seed is -1"),
         (["seed=99999999999999999999"], "seed is 9+, but a whole number .* below 2\\^63"),
         (["env.horizon=99999999999"], "env.horizon is 9+ steps, .* be from 1 to 2147483647: set"),

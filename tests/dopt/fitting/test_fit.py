@@ -178,7 +178,7 @@ def test_units_of_a_state_do_not_matter() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"width": -1}, "width is -1"),
+        ({"width": -1}, "width is -1, but a whole number of at least 0"),
         ({"hold": "cubic"}, "hold is 'cubic'"),
         ({"window": 1e9}, "window is"),
         ({"weights": (0.0,), "width": 4}, "weights is"),
@@ -195,6 +195,8 @@ def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) 
     given = {"logs": run(0, 60), "width": 0} | arguments
     with pytest.raises(SpecificationError, match=said):
         dopt.fit(declared(), **given)  # type: ignore[arg-type]
+    with pytest.raises(SpecificationError, match=r"dopt\.Plant is expected"):
+        dopt.fit({}, **given)  # type: ignore[arg-type]
 
 
 def test_a_plant_without_unknowns_gets_a_network_alone() -> None:
