@@ -211,6 +211,14 @@ class Log:
         log.notes = (*notes, *log.notes)
         return log
 
+    @classmethod
+    def of_pieces(cls, states: Sequence[str], inputs: Sequence[str], pieces: Sequence[Piece]) -> Log:
+        """Return the log of pieces that are as :class:`Piece` describes."""
+        log = cls.__new__(cls)
+        log.states, log.inputs = tuple(states), tuple(inputs)
+        log.pieces, log.notes = tuple(pieces), ()
+        return log
+
     @property
     def n_rows(self) -> int:
         """Rows of all pieces."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import signal
@@ -28,16 +29,17 @@ from dopt.explorer.arguments import (
     within,
 )
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
+from dopt.explorer.refit import FitBeside
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
-from dopt.learning import Learner
-from dopt.models import Model
+from dopt.learning import Learner, SimulationError
+from dopt.models import MLP, Model
 from dopt.policies import Policy
 from dopt.spec.config import LARGEST_HORIZON, completed
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.plant import Plant
+from dopt.systems.plant import ExploredPlant, Plant
 from dopt.types import Array
 
 # Calls that Ctrl-C does not break off.
@@ -131,6 +133,8 @@ class Explorer(SavedExplored):
         calls of :meth:`reset`
     ``missed``
         questions that were answered with the fallback, because the plan was not ready in time
+    ``refits``
+        fits of the learner 'simulation_error' that came into force
 
     Of a plant some of whose states are measured with noise (``Plant(measured=...)``), :meth:`ask`
     and :meth:`tell` are given these states, (n,), in the order of all, in their place; the learner
@@ -144,7 +148,9 @@ class Explorer(SavedExplored):
         (:mod:`dopt.spec.scaled`); a system, such as one of ``dopt.SYSTEMS`` or an
         environment of Gymnasium, says by its horizon how many steps there are.
     policy, model, learner : str, mapping or object
-        As in :meth:`dopt.TrialSpec.of_system`.
+        As in :meth:`dopt.TrialSpec.of_system`. Without a model it is 'mlp', with one hidden layer
+        for the learner 'simulation_error', which integrates a plant by the method of Runge and
+        Kutta.
     limits : mapping, optional
         Bounds of states and inputs that inputs are to heed, and rates of inputs, such as
         ``{"bounds": {"angle": [-2, 2], "voltage": [-5, 5]}, "rates": {"voltage": 100}}``
@@ -179,7 +185,7 @@ class Explorer(SavedExplored):
         plant: Plant | System,
         *,
         policy: str | Mapping[str, object] | Policy = "d_optimal",
-        model: str | Mapping[str, object] | Model = "mlp",
+        model: str | Mapping[str, object] | Model | None = None,
         learner: str | Mapping[str, object] | Learner = "adam_window",
         limits: Mapping[str, object] | None = None,
         seed: int = 0,
@@ -196,9 +202,12 @@ class Explorer(SavedExplored):
         )
         instance("journal", journal, str | Path | None, "the path of a file")
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
+        if SimulationError.name in (learner, *_named(learner)):
+            model = {"name": "mlp", "depth": 1} if model is None else model
+            plant = dataclasses.replace(plant, integrator="rk4") if isinstance(plant, Plant) else plant
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
         spec = TrialSpec.of_system(
-            *(system, policy), model=model, learner=learner, limits=limits, seed=seed, path=path
+            *(system, policy), model=model or "mlp", learner=learner, limits=limits, seed=seed, path=path
         )
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, TIMEOUT_MAX)
@@ -225,6 +234,8 @@ class Explorer(SavedExplored):
         self._unlearned = UnlearnedStates(spec.system.dt)
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
         self._planner = PunctualPlanner(self._state.plan, deadline)
+        self._fits = FitBeside() if isinstance(spec.learner, SimulationError) else None
+        self._waits = deadline is None
         if self._journal is not None:
             self._resume(self._journal)
 
@@ -319,7 +330,10 @@ class Explorer(SavedExplored):
             self._require_step()
             self._wait()
             self._told = np.array(state, dtype=float), now
-            return self._take_in(x, u, now)
+            learned = self._take_in(x, u, now)
+            if learned and self._fits is not None:
+                self._refit(self._fits)
+            return learned
 
     def _take_in(self, x: Array, applied: Array | None, now: float | None) -> bool:
         state, dt = self._state, self.spec.system.dt
@@ -351,6 +365,25 @@ class Explorer(SavedExplored):
             self._note(event)
             return True
         return False
+
+    def _refit(self, fits: FitBeside) -> None:
+        """Let a fit that is done come into force, and begin the next one when it is due.
+
+        Without a deadline a fit is waited for when the next one is due.
+        """
+        learner, model, run = self.spec.learner, self.spec.model, self._state.run
+        assert isinstance(learner, SimulationError) and isinstance(model, MLP)
+        due = max(learner.first_rows, (1.0 + learner.growth) * max(run.fitted, fits.rows))
+        if fits.is_ready or (fits.is_running and self._waits and run.rows >= due):
+            found = fits.take()
+            if isinstance(found, str):
+                _log.warning("no fit to %d rows came into force: %s", fits.rows, found)
+            else:
+                self._note(self._state.refitted(found, fits.rows))
+        if not fits.is_running and run.rows >= due and self.n_steps < self.spec.system.horizon:
+            assert isinstance(self.spec.system, ExploredPlant)
+            plant = self.spec.system.plant
+            fits.begin(plant, run.log(plant), run.rows, model.width, self.spec.seed)
 
     def _elapsed(self, now: float | None) -> float:
         """Return the seconds since the last state."""
@@ -444,6 +477,8 @@ class Explorer(SavedExplored):
                 self._wait()
         finally:
             self._planner.close()
+            if self._fits is not None:
+                self._fits.close()
             if self._journal is not None:
                 self._journal.close()
             self._close_savers()
@@ -458,6 +493,11 @@ class Explorer(SavedExplored):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _named(part: object) -> tuple[object, ...]:
+    """Return the name of a section or an object, if it has one."""
+    return (part.get("name"),) if isinstance(part, Mapping) else (getattr(part, "name", None),)
 
 
 def _about(spec: TrialSpec) -> Event:

@@ -8,6 +8,7 @@ is not known, until nothing else is on the way.
 
 from __future__ import annotations
 
+import collections
 import math
 
 import numpy as np
@@ -15,6 +16,9 @@ import numpy as np
 from dopt.systems.base import System
 from dopt.systems.plant import ExploredPlant
 from dopt.types import Array
+
+REMEMBERED = 1000
+"""Inputs that are kept for another delay or lag; what was before the first is taken for it."""
 
 SETTLED = 40.0
 """Time constants of the lag after which nothing is left of an earlier input in a double."""
@@ -30,15 +34,25 @@ class InFlight:
     """
 
     def __init__(self, system: System) -> None:
-        plant = system.plant if isinstance(system, ExploredPlant) else None
-        late = plant is not None and bool(plant.delay or plant.lag)
-        self._system, self._plant = system, plant if late else None
+        self._system = system
         self.reset()
 
     def reset(self) -> None:
         """Take all inputs so far for 0."""
-        self._flight = self._plant.flight() if self._plant else None
-        self._last = np.zeros(self._system.n_inputs)
+        system = self._system
+        self._flight = system.flight() if isinstance(system, ExploredPlant) else None
+        self._last = np.zeros(system.n_inputs)
+        self._departed = collections.deque([self._last], maxlen=REMEMBERED)
+
+    def retimed(self, system: ExploredPlant) -> InFlight:
+        """Return the same inputs on their way to a plant with another delay or lag."""
+        other = InFlight(system)
+        if other._flight is not None:
+            other._flight.settle(self._departed[0])
+            for u in self._departed:
+                other._flight.depart(u)
+        other._last, other._departed = self._last, self._departed
+        return other
 
     def cut(self, u: Array) -> Array:
         """Return what the supply can apply of an input, (m,)."""
@@ -50,6 +64,7 @@ class InFlight:
         if self._flight is None:
             return u
         self._last = u
+        self._departed.append(u)
         return self._flight.depart(u)
 
     def hold(self, u: Array | None, seconds: float | None) -> None:
@@ -62,9 +77,11 @@ class InFlight:
         steps = math.inf if seconds is None else seconds / dt
         if steps >= longest:
             self._flight.settle(self._last)
+            self._departed.clear()
+            self._departed.append(self._last)
             return
         for _ in range(round(steps)):
-            self._flight.depart(self._last)
+            self.depart(self._last)
 
     def ahead(self) -> tuple[Array, Array] | None:
         """Return what acts until an input that departs now arrives, (n, m), and how long [s], (n,).
@@ -76,7 +93,7 @@ class InFlight:
     def acted(self, inputs: Array) -> Array:
         """Return what acted in a run, (T, m), before which its first input was held."""
         cut = self.cut(inputs)
-        if self._plant is None or not len(inputs):
+        if self._flight is None or not len(inputs):
             return cut
         run = InFlight(self._system)
         run.hold(cut[0], None)

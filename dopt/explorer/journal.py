@@ -24,8 +24,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dopt.errors import ExplorationError, SpecificationError, given_path
-from dopt.explorer.arguments import finite, seconds, within
+from dopt.explorer.arguments import finite, seconds, whole, within
 from dopt.process import lock_file
 
 FORMAT = 2
@@ -239,6 +241,7 @@ _ENTRIES = {
     "gap": ("gap", "time"),
     "lost": ("lost",),
     "counted": ("counted",),
+    "refit": ("refit", "fitted", "rows"),
 }
 _NAMES = {"lost": ("unusable", "resets"), "counted": ("repeated", "out_of_order")}
 _INPUTS = ("applied", "plan", "missed")
@@ -255,6 +258,10 @@ def is_event(event: Event, n_states: int, n_inputs: int) -> bool:
                 return event[entry] in _NAMES[entry]
             if entry == "dt":
                 within(entry, event[entry], math.inf)
+            elif entry == "rows":
+                whole(entry, event[entry], 1)
+            elif entry in ("refit", "fitted"):
+                finite(entry, event[entry], np.size(event[entry]))
             elif entry == "time":
                 seconds(event[entry])
             else:

@@ -24,6 +24,7 @@ from dopt.spec.scaled import learned_accelerations, scaled
 from dopt.spec.trial import PrequentialTrial, TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import start_variances
+from dopt.systems.plant import ExploredPlant, first_guess
 from dopt.types import Array
 
 if TYPE_CHECKING:
@@ -91,16 +92,18 @@ def free_run_error(
     states: npt.ArrayLike,
     inputs: npt.ArrayLike,
     steps: int = 50,
+    system: System | None = None,
 ) -> float:
     """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations, (N, r).
 
-    All numbers are in the units of the plant.
+    All numbers are in the units of the plant, which ``system`` describes if it is another one than
+    in the specification, as after a refit.
 
     Where the run has the measured states alone, predictions start from the estimates of a filter,
     the first of them after so many steps as a prediction has, and the error is taken over the
     measured states.
     """
-    system = spec.system
+    system = spec.system if system is None else system
     y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
     steps = whole("steps", steps)
     rows = _rows_of(system, y)
@@ -112,7 +115,7 @@ def free_run_error(
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
-    x = y if isinstance(rows, slice) else _estimated(spec, predict, y, u, rows)
+    x = y if isinstance(rows, slice) else _estimated(spec, system, predict, y, u, rows)
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
     starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
@@ -127,13 +130,14 @@ def free_run_error(
 
 def _estimated(
     spec: TrialSpec,
+    system: System,
     predict: Callable[[Array, Array], Array],
     outputs: Array,
     inputs: Array,
     rows: list[int],
 ) -> Array:
     """Return estimates of the states, (T + 1, d), of which some rows were measured."""
-    found, variance = scaled(spec.system), _variance(spec)
+    found, variance = scaled(system), _variance(spec)
     y, u = found.of_states(outputs, rows), found.of_inputs(inputs)
     predict = found.scaled_predictions(predict)
     return found.states * filtered_states(found.system, predict, y, u, variance)
@@ -185,6 +189,7 @@ KINDS = (
     "jumps",
     "resets",
     "missed",
+    "refits",
 )
 """Kinds of events in :attr:`Explored.counts`."""
 
@@ -218,6 +223,17 @@ class Explored:
         They do not depend on the units of the plant (:mod:`dopt.spec.scaled`).
         """
         return self._state.steps.parameters
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Constants of a plant, ``delay`` and ``lag`` [s]: first guesses, or what a refit found."""
+        system = self._state.system
+        if not isinstance(system, ExploredPlant):
+            return {}
+        plant = system.plant
+        guesses = *plant.guesses.values(), first_guess(plant.delay), first_guess(plant.lag)
+        names = *plant.constants, "delay", "lag"
+        return dict(zip(names, system.fitted or guesses, strict=True))
 
     @property
     def states(self) -> Array:
@@ -277,7 +293,7 @@ class Explored:
         SpecificationError
             If the shapes do not fit, or the run has fewer steps.
         """
-        return free_run_error(self.spec, self.predict, states, inputs, steps)
+        return free_run_error(self.spec, self.predict, states, inputs, steps, self._state.system)
 
 
 def predict(
@@ -404,7 +420,9 @@ class SavedExplored(Explored):
                 f"both of a recorded run."
             )
         predicted = functools.partial(predict, self.spec, parameters)
-        return Assessment(n, "free_run_error", free_run_error(self.spec, predicted, *test))
+        system = self._state.system
+        error = free_run_error(self.spec, predicted, *test, system=system)
+        return Assessment(n, "free_run_error", error)
 
     def _close_savers(self) -> None:
         """End the launches of the saves."""

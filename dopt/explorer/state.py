@@ -12,6 +12,8 @@ event                   meaning
 ``gap``, ``time``       a state that followed after another time than about dt
 ``lost``                a state that could not be used, after which the present one is unknown
 ``counted``             something that changes nothing, by the name of its count
+``refit``, ``fitted``,  parameters of the model, and values of the constants, delay and lag, that
+``rows``                a fit to so many rows has found
 ======================  =====================================================================
 
 Events are in the units of the plant; the steps are taken in scaled numbers
@@ -20,6 +22,7 @@ Events are in the units of the plant; the steps are taken in scaled numbers
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections import Counter
 from collections.abc import Callable
@@ -32,11 +35,14 @@ import numpy as np
 from dopt.errors import ExplorationError
 from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
+from dopt.explorer.refit import Found, Recording
+from dopt.learning import SimulationError
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.scaled import scaled, scaled_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import next_state
+from dopt.systems.plant import ExploredPlant
 from dopt.types import Array
 
 # A planner that is waited for until a deadline.
@@ -131,6 +137,7 @@ class Steps(Protocol):
     def note_asked(self, u: Array) -> None: ...
     def plan_input(self, t: int) -> None: ...
     def begin(self, t: int, state: Array) -> None: ...
+    def replace(self, parameters: Array, constants: Array) -> None: ...
     def take_in(self, t: int, dt: float) -> bool: ...
 
 
@@ -141,6 +148,10 @@ class ExplorerState:
     ----------
     spec : TrialSpec
         Plant, policy, model, learner and seed.
+    system : System
+        The plant, with the constants, delay and lag that the last refit has found.
+    run : Recording
+        What was measured and applied, for a learner that fits it.
     steps : Steps
         The arrays and the steps of the trial, in scaled numbers.
     states, inputs : (T + 1, d), (T, m)
@@ -164,7 +175,8 @@ class ExplorerState:
     """
 
     def __init__(self, spec: TrialSpec) -> None:
-        self.spec, self._scaled = spec, scaled(spec.system)
+        self.spec, self.system, self._scaled = spec, spec.system, scaled(spec.system)
+        self.run = Recording(spec.learner)
         self.steps = _steps_of(scaled_trial(spec))
         self.done, self.counts = 0, Counter[str]()
         self.present: Array | None = None
@@ -182,6 +194,7 @@ class ExplorerState:
 
     def do(self, event: Event) -> None:
         """Change by one event."""
+        self.run.note(event, self)
         if "learn" in event:
             self._learn(event)
         elif "plan" in event:
@@ -207,14 +220,34 @@ class ExplorerState:
             else:
                 self.flight.hold(self.answer, 0.0)
             self.present = self.answer = self.time = None
+        elif "refit" in event:
+            self._refit(event)
         else:
             self.counts[event["counted"]] += 1
+
+    def refitted(self, found: Found, rows: int) -> Event:
+        """Return the event of a fit to so many rows that comes into force."""
+        assert isinstance(self.spec.model, MLP)
+        theta = found.parameters(self._scaled, self.spec.model.width, self.steps.parameters)
+        return {"refit": theta.tolist(), "fitted": found.fitted, "rows": rows}
+
+    def _refit(self, event: Event) -> None:
+        assert isinstance(self.system, ExploredPlant)
+        self.counts["refits"] += 1
+        self.system = dataclasses.replace(self.system, fitted=tuple(event["fitted"]))
+        self._scaled = scaled(self.system)
+        self.steps.replace(np.array(event["refit"]), np.array(event["fitted"][:-2]))
+        self.flight = self.flight.retimed(self.system)
 
     def may_replay(self, event: Event) -> bool:
         """Return True if an event of a journal can follow the present state."""
         needs_state = event.keys() & {"learn", "plan", "missed"}
         follows = self.present is not None and self.done < self.spec.system.horizon
         whole = is_event(event, len(self._measured), self.spec.system.n_inputs)
+        if "refit" in event:
+            sizes = len(self.steps.parameters), len(self.system.parameters) + 2
+            fits = isinstance(self.spec.learner, SimulationError)
+            whole &= fits and (len(event["refit"]), len(event["fitted"])) == sizes
         return whole and (follows or not needs_state)
 
     def replay(self, event: Event) -> None:

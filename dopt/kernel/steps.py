@@ -253,6 +253,11 @@ class KernelSteps(KernelState):
         if len(self.state.estimate.starts):
             self.state.estimate.starts[t] = state
 
+    def replace(self, parameters: Array, constants: Array) -> None:
+        """Take other parameters of the model, (q,), and other constants of the system."""
+        self.state.theta[:] = parameters
+        self.trial.plant.parameters[:] = constants
+
     def measure(self, t: int, measured: Array) -> None:
         """Write what was measured after step t: x_{t+1}, (d,), or the outputs, (n,)."""
         known = not self.spec.system.n_measured

@@ -11,6 +11,7 @@ from dopt.learning.least_squares import (
     JointKalman,
     RecursiveLeastSquares,
 )
+from dopt.learning.simulation_error import SimulationError
 
 LEARNERS: dict[str, type[Learner]] = {
     learner.name: learner
@@ -23,6 +24,7 @@ LEARNERS: dict[str, type[Learner]] = {
         GaussNewton,
         JointKalman,
         Conditioning,
+        SimulationError,
     )
 }
 
@@ -39,4 +41,5 @@ __all__ = [
     "JointKalman",
     "Learner",
     "RecursiveLeastSquares",
+    "SimulationError",
 ]

@@ -90,6 +90,9 @@ class ReferenceSteps:
         """Let step t begin at a state, (d,), whatever came before it."""
         self.states[t] = state
 
+    def replace(self, parameters: Array, constants: Array) -> None:
+        """Do nothing: no learner that replaces parameters runs here."""
+
     def measure(self, t: int, measured: Array) -> None:
         """Write what was measured after step t: x_{t+1}, (d,)."""
         self.states[t + 1] = measured

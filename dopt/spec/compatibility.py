@@ -24,6 +24,7 @@ from dopt.learning import (
     JointKalman,
     Learner,
     RecursiveLeastSquares,
+    SimulationError,
 )
 from dopt.learning.base import CustomLearner
 from dopt.models import (
@@ -110,6 +111,14 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     if isinstance(policy, Disagreement) and not isinstance(learner, Adam):
         expected = "learner 'adam' or 'adam_window', which can learn for many networks"
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
+    if isinstance(learner, SimulationError):
+        if not isinstance(system, ExploredPlant):
+            expected = "a dopt.Plant that a dopt.Explorer explores"
+            raise mismatch(f"learner '{learner.name}'", expected, f"env '{system.name}'")
+        if type(model) is not MLP or model.depth != 1:
+            expected = "model 'mlp' with model.depth 1"
+            depth = f" with model.depth {model.depth}" if isinstance(model, MLP) else ""
+            raise mismatch(f"learner '{learner.name}'", expected, f"{given}{depth}")
     _check_sensors(system, learner)
     _check_model(system, policy, model, learner)
     _check_inputs(system, policy, model, learner)
@@ -143,7 +152,8 @@ def check_reference(
         (f"model '{model.name}' with the inputs that it reads", not model.n_inputs_read(system)),
         (
             f"learner '{learner.name}'",
-            isinstance(learner, Adam | CustomLearner) or least_squares,
+            (isinstance(learner, Adam | CustomLearner) and not isinstance(learner, SimulationError))
+            or least_squares,
         ),
         ("policy.information 'fresh'", not is_fresh(policy)),
         ("states that are measured with noise", not system.n_measured),

@@ -426,12 +426,6 @@ class Plant:
             grid_points=(GRID_POINTS,) * len(axes),
         )
 
-    def flight(self) -> Flight:
-        """Return the inputs on their way to the plant: none yet, after zeros."""
-        delay, lag = first_guess(self.delay), first_guess(self.lag)
-        samples = round(delay / self.dt, 9)  # of 0.3 s by 0.1 s, 3
-        return Flight(samples, lag, self.dt, len(self.inputs))
-
     @property
     def guesses(self) -> dict[str, float]:
         """The constants, each unknown one by its first guess."""
@@ -501,6 +495,7 @@ class ExploredPlant(BlackBox):
     _constants: ClassVar[tuple[float, ...]] = ()
 
     scaled: bool = unvalidated(False)
+    fitted: tuple[float, ...] = unvalidated(())  # constants, delay and lag in place of the guesses
 
     @property
     def state_limits(self) -> Array:
@@ -515,11 +510,20 @@ class ExploredPlant(BlackBox):
         """
         plant = self.plant
         system = plant._system(plant._scaled_class, plant.scales, plant.gamma, self.horizon)
-        return dataclasses.replace(system, state_limit=LIMIT)
+        return dataclasses.replace(system, state_limit=LIMIT, fitted=self.fitted)
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        return self._constants
+        return self.fitted[:-2] or self._constants
+
+    def flight(self) -> Flight | None:
+        """Return the inputs on their way to the plant, none yet after zeros; None if none are."""
+        plant = self.plant
+        if not (plant.delay or plant.lag):
+            return None
+        delay, lag = self.fitted[-2:] or (first_guess(plant.delay), first_guess(plant.lag))
+        samples = round(delay / self.dt, 9)  # of 0.3 s by 0.1 s, 3
+        return Flight(samples, lag, self.dt, self.n_inputs)
 
     def to_section(self) -> dict[str, object]:
         """Return what identifies the plant and its exploration."""

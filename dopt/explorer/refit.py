@@ -1,0 +1,257 @@
+"""Fits of the simulation beside an exploration, by a process of its own.
+
+The process is given the plant and what was measured so far, and answers with the constants, the
+delay, the lag and the network that :func:`dopt.fit` has found, as long as the rig needs for it: the
+exploration goes on. A network of the fit sees states by their seen ranges, and one of the kernel
+scaled numbers; both are affine in a state, so that the weights of one are the weights of the other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import weakref
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from dopt.errors import ExplorationError, SpecificationError
+from dopt.explorer.journal import Event
+from dopt.learning import Learner, SimulationError
+from dopt.log import Log, Piece
+from dopt.spec.scaled import Scaled
+from dopt.systems.plant import Plant, unknown
+from dopt.types import Array
+
+if TYPE_CHECKING:
+    from dopt.explorer.state import ExplorerState
+
+WEIGHTS = (30.0, 10.0, 3.0, 1.0)
+"""Weights s that the fits try (:func:`dopt.fit`)."""
+
+
+class Recording:
+    """What was measured and applied in an exploration, in pieces without gaps.
+
+    Attributes
+    ----------
+    rows : int
+        Learned steps in all pieces.
+    fitted : int
+        Rows of the last fit that came into force, 0 without one.
+    """
+
+    def __init__(self, learner: Learner) -> None:
+        self._kept = isinstance(learner, SimulationError)
+        self._pieces: list[tuple[list[float], list[Any], list[Any]]] = []
+        self._ended = True
+        self.rows = self.fitted = 0
+
+    def note(self, event: Event, state: ExplorerState) -> None:
+        """Take in an event before the state changes by it."""
+        if not self._kept:
+            return
+        if "learn" in event:
+            assert state.present is not None
+            if self._ended:
+                self._pieces.append(([0.0], [state.present.tolist()], []))
+                self._ended = False
+            time, measured, inputs = self._pieces[-1]
+            time.append(time[-1] + event["dt"])
+            measured.append(event["learn"])
+            inputs.append(event["applied"])
+            self.rows += 1
+        elif "begin" in event:
+            again = state.present is not None and event["begin"] == state.present.tolist()
+            late = 0.0 if None in (event["time"], state.time) else event["time"] - state.time
+            if again and not self._ended and 0.0 <= late < 0.5 * state.spec.system.dt:
+                self._pieces[-1][0][-1] += late  # the same state, with the time of the question
+            else:
+                self._ended = True
+        elif "gap" in event or "lost" in event:
+            self._ended = True
+        elif "refit" in event:
+            self.fitted = event["rows"]
+
+    def log(self, plant: Plant) -> Log:
+        """Return the log, (rows + 1) of each piece; the input of a last row is the one before it.
+
+        Raises
+        ------
+        SpecificationError
+            If nothing was learned yet.
+        """
+        if not self._pieces:
+            raise SpecificationError(
+                "nothing was learned yet, but a log has two rows or more: ask() and tell() first."
+            )
+        states = [name for name in plant.states if name in plant.measured] or [*plant.states]
+        return Log.of_pieces(
+            states,
+            [*plant.inputs],
+            [
+                Piece(np.array(time), np.array(measured), np.array([*inputs, inputs[-1]]))
+                for time, measured, inputs in self._pieces
+            ],
+        )
+
+
+class Found(NamedTuple):
+    """What a fit has found, in the units of the plant."""
+
+    constants: Array  # (c,)
+    delay: float
+    lag: float
+    weights: Array  # W₁ (w, p), b₁ (w), W₂ (r, w), b₂ (r); empty without a network
+    centers: Array  # (p,)
+    scales: Array  # (p,)
+    sizes: Array  # (r,)
+
+    @property
+    def fitted(self) -> list[float]:
+        """Constants, delay and lag."""
+        return [*self.constants.tolist(), max(self.delay, 0.0), self.lag]
+
+    def parameters(self, scaled: Scaled, width: int, present: Array) -> Array:
+        """Return the parameters of a network in scaled numbers, (q,).
+
+        Without a network its output layer is 0, and the first one as it is at present.
+        """
+        system = scaled.system
+        features, p = system.features, len(system.features)
+        first, last = width * p + width, present.copy()
+        last[first:] = 0.0
+        if not len(self.weights):
+            return last
+        divisors, by_state = np.array(system.feature_scales), np.zeros(p, bool)
+        by_state[:] = [feature.kind == "identity" for feature in features]
+        units = np.array([scaled.states[feature.index] for feature in features])
+        gain = np.where(by_state, units / self.scales, 1.0) * divisors
+        shift = np.where(by_state, -self.centers / self.scales, 0.0)
+        W1 = self.weights[: width * p].reshape(width, p)
+        b1, outputs = self.weights[width * p : first], self.weights[first:]
+        sizes = self.sizes / scaled.accelerations
+        of_rows = np.concatenate([np.repeat(sizes, width), sizes])
+        return np.concatenate([(W1 * gain).ravel(), b1 + W1 @ shift, outputs * of_rows])
+
+
+def _first_request() -> tuple[Plant, Log, int, int]:
+    """Return a small fit: dx/dt = -a x + u."""
+    t, u = 0.1 * np.arange(150), np.sign(np.sin(np.arange(150.0)))
+    x = np.zeros(150)
+    for k in range(149):
+        x[k + 1] = u[k] + (x[k] - u[k]) * np.exp(-0.1)
+    plant = Plant(
+        **{"states": {"x": ""}, "inputs": {"u": ""}, "dt": 0.1, "gamma": 1.0, "box": {"x": 1.0}},
+        **{"known": {"x": "u - a * x"}, "constants": {"a": unknown(1.0)}, "learned": ["x"]},
+        **{"delay": unknown(0.0, spread=0.1), "lag": unknown(0.01)},
+    )
+    return plant, Log.of_pieces(["x"], ["u"], [Piece(t, x[:, None], u[:, None])]), 1, 0
+
+
+def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
+    from dopt.fitting.fit import fit
+
+    chosen = fit(plant, log, width=width, seed=seed, weights=WEIGHTS, workers=1).chosen
+    values, s = chosen.model.values(chosen.solution.p), chosen.model.structure
+    layout = s.feature_centers, s.feature_scales, values.sizes
+    weights = values.weights if chosen.model.width else np.empty(0)
+    return Found(values.constants, values.delay, values.lag, weights, *layout)
+
+
+class FitBeside:
+    """A process that fits one log at a time.
+
+    Attributes
+    ----------
+    rows : int
+        Rows of the log that was given last.
+    """
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._thread = ThreadPoolExecutor(1, "fit")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._answer: Future[Found | str] | None = None
+        self._thread.submit(self._ask, _first_request())  # compiled before the first fit is due
+
+    @property
+    def is_running(self) -> bool:
+        return self._answer is not None
+
+    @property
+    def is_ready(self) -> bool:
+        return self._answer is not None and self._answer.done()
+
+    def begin(self, plant: Plant, log: Log, rows: int, width: int, seed: int) -> None:
+        """Begin a fit."""
+        self.rows = rows
+        self._answer = self._thread.submit(self._ask, (plant, log, width, seed))
+
+    def take(self) -> Found | str:
+        """Wait for what the fit has found, or for the sentence that says why there is nothing."""
+        assert self._answer is not None
+        answer, self._answer = self._answer, None
+        return answer.result()
+
+    def _ask(self, request: tuple[Any, ...]) -> Found | str:
+        if self._process is None or self._process.poll() is not None:
+            self._process = _started()
+            weakref.finalize(self, self._process.kill)
+        assert self._process.stdin and self._process.stdout
+        try:
+            pickle.dump(request, self._process.stdin)
+            self._process.stdin.flush()
+            answer: Found | str = pickle.load(self._process.stdout)  # noqa: S301  # of our own process
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            self._process.kill()
+            return f"its process has ended ({type(error).__name__}); another one begins"
+        return answer
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        if self._process is not None:
+            self._process.kill()
+        self._thread.shutdown()
+        if self._process is not None:
+            self._process.wait()
+
+
+def _started() -> subprocess.Popen[bytes]:
+    paths = os.pathsep.join(path for path in sys.path if path)
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", "from dopt.explorer.refit import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": paths},
+        )
+    except OSError as error:
+        raise ExplorationError(
+            f"the process that fits beside the exploration cannot be started ({error}): free "
+            f"memory, or choose another learner."
+        ) from error
+
+
+def serve() -> None:
+    """Answer requests from the standard input until it ends."""
+    with contextlib.suppress(AttributeError, OSError):  # which Windows lacks
+        os.nice(10)  # the exploration comes first
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what is printed does not mix with them
+    while True:
+        try:
+            request = pickle.load(sys.stdin.buffer)  # noqa: S301  # of the process that began this
+        except EOFError:
+            return
+        try:
+            answer: Found | str = _found(*request)
+        except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
+            answer = str(error)
+        pickle.dump(answer, answers)
+        answers.flush()
+
