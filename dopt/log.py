@@ -212,7 +212,9 @@ class Log:
         return log
 
     @classmethod
-    def of_pieces(cls, states: Sequence[str], inputs: Sequence[str], pieces: Sequence[Piece]) -> Log:
+    def of_pieces(
+        cls, states: Sequence[str], inputs: Sequence[str], pieces: Sequence[Piece]
+    ) -> Log:
         """Return the log of pieces that are as :class:`Piece` describes."""
         log = cls.__new__(cls)
         log.states, log.inputs = tuple(states), tuple(inputs)

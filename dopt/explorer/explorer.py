@@ -204,10 +204,17 @@ class Explorer(SavedExplored):
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
         if SimulationError.name in (learner, *_named(learner)):
             model = {"name": "mlp", "depth": 1} if model is None else model
-            plant = dataclasses.replace(plant, integrator="rk4") if isinstance(plant, Plant) else plant
+            plant = (
+                dataclasses.replace(plant, integrator="rk4") if isinstance(plant, Plant) else plant
+            )
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
         spec = TrialSpec.of_system(
-            *(system, policy), model=model or "mlp", learner=learner, limits=limits, seed=seed, path=path
+            *(system, policy),
+            model=model or "mlp",
+            learner=learner,
+            limits=limits,
+            seed=seed,
+            path=path,
         )
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, TIMEOUT_MAX)
@@ -372,7 +379,8 @@ class Explorer(SavedExplored):
         Without a deadline a fit is waited for when the next one is due.
         """
         learner, model, run = self.spec.learner, self.spec.model, self._state.run
-        assert isinstance(learner, SimulationError) and isinstance(model, MLP)
+        assert isinstance(learner, SimulationError)
+        assert isinstance(model, MLP)
         due = max(learner.first_rows, (1.0 + learner.growth) * max(run.fitted, fits.rows))
         if fits.is_ready or (fits.is_running and self._waits and run.rows >= due):
             found = fits.take()

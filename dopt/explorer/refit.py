@@ -13,6 +13,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -141,16 +142,23 @@ class Found(NamedTuple):
 
 def _first_request() -> tuple[Plant, Log, int, int]:
     """Return a small fit: dx/dt = -a x + u."""
-    t, u = 0.1 * np.arange(150), np.sign(np.sin(np.arange(150.0)))
-    x = np.zeros(150)
+    u, x = np.sign(np.sin(np.arange(150.0))), np.zeros(150)
     for k in range(149):
         x[k + 1] = u[k] + (x[k] - u[k]) * np.exp(-0.1)
     plant = Plant(
-        **{"states": {"x": ""}, "inputs": {"u": ""}, "dt": 0.1, "gamma": 1.0, "box": {"x": 1.0}},
-        **{"known": {"x": "u - a * x"}, "constants": {"a": unknown(1.0)}, "learned": ["x"]},
-        **{"delay": unknown(0.0, spread=0.1), "lag": unknown(0.01)},
+        states={"x": "m"},
+        inputs={"u": "m/s"},
+        dt=0.1,
+        gamma=1.0,
+        known={"x": "u - a * x"},
+        constants={"a": unknown(1.0)},
+        learned=["x"],
+        box={"x": 1.0},
+        delay=unknown(0.0, spread=0.1),
+        lag=unknown(0.01),
     )
-    return plant, Log.of_pieces(["x"], ["u"], [Piece(t, x[:, None], u[:, None])]), 1, 0
+    pieces = [Piece(0.1 * np.arange(150.0), x[:, None], u[:, None])]
+    return plant, Log.of_pieces(["x"], ["u"], pieces), 1, 0
 
 
 def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
@@ -175,6 +183,7 @@ class FitBeside:
     def __init__(self) -> None:
         self.rows = 0
         self._thread = ThreadPoolExecutor(1, "fit")
+        self._starting, self._is_closed = threading.Lock(), False
         self._process: subprocess.Popen[bytes] | None = None
         self._answer: Future[Found | str] | None = None
         self._thread.submit(self._ask, _first_request())  # compiled before the first fit is due
@@ -199,26 +208,32 @@ class FitBeside:
         return answer.result()
 
     def _ask(self, request: tuple[Any, ...]) -> Found | str:
-        if self._process is None or self._process.poll() is not None:
-            self._process = _started()
-            weakref.finalize(self, self._process.kill)
-        assert self._process.stdin and self._process.stdout
+        with self._starting:
+            if self._is_closed:
+                return "the exploration is closed"
+            if self._process is None or self._process.poll() is not None:
+                self._process = _started()
+                weakref.finalize(self, _end, self._process)
+        assert self._process.stdin
+        assert self._process.stdout
         try:
             pickle.dump(request, self._process.stdin)
             self._process.stdin.flush()
-            answer: Found | str = pickle.load(self._process.stdout)  # noqa: S301  # of our own process
+            answer: Found | str = pickle.load(self._process.stdout)  # of our own process
         except (OSError, EOFError, pickle.UnpicklingError) as error:
-            self._process.kill()
+            _end(self._process)
             return f"its process has ended ({type(error).__name__}); another one begins"
         return answer
 
     def close(self) -> None:
         """End the process, whatever it does."""
+        with self._starting:
+            self._is_closed = True
+            if self._process is not None:
+                self._process.kill()
+        self._thread.shutdown(cancel_futures=True)
         if self._process is not None:
-            self._process.kill()
-        self._thread.shutdown()
-        if self._process is not None:
-            self._process.wait()
+            _end(self._process)
 
 
 def _started() -> subprocess.Popen[bytes]:
@@ -237,6 +252,12 @@ def _started() -> subprocess.Popen[bytes]:
         ) from error
 
 
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    with contextlib.suppress(OSError):
+        process.communicate()  # closes the pipes, and waits
+
+
 def serve() -> None:
     """Answer requests from the standard input until it ends."""
     with contextlib.suppress(AttributeError, OSError):  # which Windows lacks
@@ -245,7 +266,7 @@ def serve() -> None:
     os.dup2(2, 1)  # what is printed does not mix with them
     while True:
         try:
-            request = pickle.load(sys.stdin.buffer)  # noqa: S301  # of the process that began this
+            request = pickle.load(sys.stdin.buffer)  # of the process that began this
         except EOFError:
             return
         try:
@@ -254,4 +275,3 @@ def serve() -> None:
             answer = str(error)
         pickle.dump(answer, answers)
         answers.flush()
-

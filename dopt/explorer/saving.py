@@ -420,8 +420,9 @@ class SavedExplored(Explored):
                 f"both of a recorded run."
             )
         predicted = functools.partial(predict, self.spec, parameters)
+        states, inputs = test
         system = self._state.system
-        error = free_run_error(self.spec, predicted, *test, system=system)
+        error = free_run_error(self.spec, predicted, states, inputs, system=system)
         return Assessment(n, "free_run_error", error)
 
     def _close_savers(self) -> None:

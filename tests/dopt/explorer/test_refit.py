@@ -1,0 +1,254 @@
+"""The learner that fits simulations beside an exploration."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt import Explorer, Plant, TrialSpec, encoder, unknown
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.explorer.flight import InFlight
+from dopt.explorer.refit import FitBeside, Found
+from dopt.fitting.model import Layout, Model
+from dopt.learning import SimulationError
+from dopt.spec.scaled import learned_accelerations, scaled
+from dopt.systems.plant import ExploredPlant
+from dopt.systems.real import Flight
+from dopt.types import Array
+from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, motor_acceleration
+
+DT = MOTOR.dt
+SMALL = {"name": "mlp", "depth": 1, "width": 6}
+PLANT = dataclasses.replace(
+    MOTOR,
+    constants={"gain": unknown(8.0)},
+    delay=unknown(0.0, spread=0.02),
+    lag=unknown(0.02),
+)
+
+
+class Rig:
+    """The motor in continuous time behind a delay of 1.5 samples and a lag of 30 ms."""
+
+    def __init__(self) -> None:
+        self._flight, self.x, self.time = Flight(1.5, 0.03, DT, 1), np.array([0.1, 0.0]), 0.0
+
+    def step(self, u: Array) -> Array:
+        acting = self._flight.depart(u)
+        for _ in range(20):
+            rate = 5.0 * acting[0] - 8.0 * math.sin(self.x[0]) - 0.6 * self.x[1]
+            self.x = self.x + DT / 20 * np.array([self.x[1], rate])
+        self.time += DT
+        return self.x
+
+
+def explorer(plant: Plant = PLANT, **more: Any) -> Explorer:
+    given = {"policy": "random", "model": SMALL, "learner": "simulation_error", "steps": 400}
+    return Explorer(plant, **{**given, **more})
+
+
+def drive(one: Explorer, rig: Rig, steps: int) -> None:
+    for _ in range(steps):
+        one.tell(rig.step(one.ask(rig.x, rig.time)), time=rig.time)
+
+
+def test_the_plant_is_found_beside_the_rig() -> None:
+    rig = Rig()
+    with explorer() as one:
+        drive(one, rig, 400)
+        assert one.counts["refits"] >= 3
+        assert one.constants["gain"] == pytest.approx(5.0, rel=0.05)
+        assert one.constants["delay"] + one.constants["lag"] == pytest.approx(0.06, abs=0.006)
+        at = one.states[:400]
+        missed = one.predict(at)[:, 0] - np.array([motor_acceleration(x) for x in at])
+        assert np.median(np.abs(missed)) < 0.5
+
+
+def test_a_journal_ends_at_the_same_parameters_bit_for_bit(tmp_path: Path) -> None:
+    path, rig = tmp_path / "run.jsonl", Rig()
+    with explorer(policy="d_optimal", journal=path) as one:
+        drive(one, rig, 260)
+        before = one.parameters.copy(), one.constants, dict(one.counts), one.inputs
+        planned = one.ask(rig.x, rig.time)
+    with explorer(policy="d_optimal", journal=path) as again:
+        after = again.parameters, again.constants, dict(again.counts), again.inputs
+        assert before[2]["refits"] >= 2
+        for left, right in zip(before, after, strict=True):
+            assert left == right if isinstance(left, dict) else (left == right).all()
+        np.testing.assert_array_equal(again.ask(rig.x, rig.time), planned)
+        drive(again, rig, 100)
+        assert again.counts["refits"] > before[2]["refits"]
+
+
+KILLED = """
+import sys
+from tests.dopt.explorer.test_refit import Rig, drive, explorer
+with explorer(journal=sys.argv[1], fsync=False) as one:
+    rig = Rig()
+    while True:
+        drive(one, rig, 1)
+        print(one.n_steps, one.counts["refits"], one.parameters.tobytes().hex(), flush=True)
+"""
+
+
+@pytest.mark.parametrize("refits", [0, 2])
+def test_what_a_killed_process_had_learned_is_there_again(tmp_path: Path, refits: int) -> None:
+    path = tmp_path / "run.jsonl"
+    code = [sys.executable, "-c", KILLED, str(path)]
+    with subprocess.Popen(code, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        for line in process.stdout:
+            steps, count, parameters = line.split()
+            if int(count) >= refits and int(steps) >= 160:  # a fit is running
+                os.kill(process.pid, signal.SIGKILL)
+                break
+        rest = process.stdout.read().splitlines()
+    steps, count, parameters = rest[-1].split() if rest else (steps, count, parameters)
+    with explorer(journal=path) as again:
+        told = (again.n_steps, again.counts["refits"], again.parameters.tobytes().hex())
+        assert told[0] >= int(steps)
+        assert told[:2] != (int(steps), int(count)) or told[2] == parameters
+
+
+def test_a_network_in_scaled_numbers_is_the_network_of_the_fit() -> None:
+    rng = np.random.default_rng(3)
+    for plant in (MOTOR, HOVERCRAFT):
+        spec = explored_spec(plant)
+        found = scaled(spec.system)
+        p, r = len(found.system.features), found.system.n_learned
+        layout = Layout(rng.normal(size=p), rng.uniform(0.5, 9.0, p), rng.uniform(0.1, 50.0, r))
+        model = Model(plant, width=6, layout=layout)
+        weights = rng.normal(size=model.n_weights)
+        numbers = np.zeros(len(plant.constants)), 0.0, 0.0, weights, *layout
+        theta = Found(*numbers).parameters(found, 6, np.zeros(model.n_weights))
+        states = rng.normal(size=(50, len(plant.states))) * 3.0
+        np.testing.assert_allclose(
+            learned_accelerations(spec, theta, states),
+            model.network(weights, states),
+            rtol=1e-9,
+            atol=1e-9,
+        )
+
+
+def explored_spec(plant: Plant) -> TrialSpec:
+    with Explorer(plant, policy="random", model=SMALL, steps=10) as one:
+        return one.spec
+
+
+@pytest.mark.parametrize(("delay", "lag"), [(0.0, 0.05), (2.3 * DT, 0.0), (3 * DT, 0.02)])
+def test_inputs_in_flight_are_as_if_the_delay_had_been_known(delay: float, lag: float) -> None:
+    system = PLANT.system(10)
+    later = dataclasses.replace(system, fitted=(5.0, delay, lag))
+    first, other = InFlight(system), InFlight(later)
+    rng = np.random.default_rng(0)
+    for flight in (first, other):
+        flight.hold(np.array([0.5]), None)
+    for u in rng.normal(size=(40, 1)):
+        first.depart(u)
+        other.depart(u)
+    second = first.retimed(later)
+    for u in rng.normal(size=(5, 1)):
+        np.testing.assert_allclose(second.depart(u), other.depart(u), atol=1e-12)
+
+
+def test_a_gap_a_reset_and_a_jump_begin_new_pieces() -> None:
+    rig = Rig()
+    with explorer() as one:
+        drive(one, rig, 10)
+        rig.time += 1.0  # a gap
+        drive(one, rig, 10)
+        one.reset()
+        drive(one, rig, 10)
+        rig.x, rig.time = rig.x + 0.5, rig.time + 0.3 * DT  # a jump
+        drive(one, rig, 10)
+        one.ask(rig.x, rig.time + 0.1 * DT)  # the same state, asked later
+        one.tell(rig.x, time=rig.time + DT)
+        log = one._state.run.log(PLANT)
+        assert [len(piece.time) for piece in log.pieces] == [11, 11, 11, 12]
+        assert log.n_rows == one.n_steps + 4
+        steps = np.diff(log.pieces[-1].time) / DT
+        assert steps == pytest.approx([*[1.0] * 9, 1.1, 0.9])
+
+
+def test_a_state_that_is_not_measured_is_left_to_the_fit() -> None:
+    plant = dataclasses.replace(PLANT, measured={"angle": encoder(4096)})
+    rig = Rig()
+    with explorer(plant) as one:
+        for _ in range(250):
+            u = one.ask(rig.x[:1], rig.time)
+            rig.step(u)
+            one.tell(rig.x[:1], time=rig.time)
+        assert one.counts["refits"] >= 1
+        assert one.constants["gain"] == pytest.approx(5.0, rel=0.2)
+
+
+def test_with_a_deadline_no_fit_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*_: object) -> str:
+        time.sleep(1.0)
+        return "nothing was found"
+
+    monkeypatch.setattr(FitBeside, "_ask", slow)
+    rig, learner = Rig(), {"name": "simulation_error", "first_rows": 20}
+    with explorer(deadline=0.5, learner=learner) as one:
+        before = time.perf_counter()
+        drive(one, rig, 60)
+        assert time.perf_counter() - before < 1.0
+        assert one.counts["refits"] == 0
+
+
+def test_a_fit_that_fails_is_said_and_the_next_one_begins(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rig = Rig()
+    with caplog.at_level(logging.WARNING, logger="dopt"), explorer() as one:
+        assert one._fits is not None
+        one._fits._thread.submit(int).result()  # until the first request is answered
+        process = one._fits._process
+        assert process is not None
+        drive(one, rig, 150)
+        process.kill()
+        drive(one, rig, 250)
+        assert one.counts["refits"] >= 1
+    assert "its process has ended" in caplog.text
+    assert process.poll() is not None
+
+
+def test_the_process_ends_with_the_exploration() -> None:
+    with explorer() as one:
+        drive(one, Rig(), 3)
+        fits = one._fits
+    assert fits is not None
+    assert fits._process is None or fits._process.poll() is not None
+
+
+def test_what_it_cannot_fit_is_refused() -> None:
+    with pytest.raises(IncompatibleError, match=r"goes with a dopt.Plant .*, but env 'pendulum'"):
+        TrialSpec.from_names(
+            "pendulum", "d_optimal", learner="simulation_error", model={"name": "mlp", "depth": 1}
+        )
+    with pytest.raises(IncompatibleError, match=r"model.depth 1, but .* with model.depth 2"):
+        explorer(model="mlp")
+    with pytest.raises(IncompatibleError, match="kernel alone"):
+        explorer(path="reference")
+    with pytest.raises(SpecificationError, match="growth"):
+        explorer(learner=SimulationError(growth=-1.0))
+
+
+def test_an_explorer_of_a_plant_has_its_guesses_as_constants() -> None:
+    with explorer() as one:
+        assert one.constants == {"gain": 8.0, "delay": 0.0, "lag": 0.02}
+        assert isinstance(one.spec.system, ExploredPlant)
+        assert one.spec.system.integrator == "rk4"
+        with pytest.raises(SpecificationError, match="nothing was learned yet"):
+            one._state.run.log(PLANT)
