@@ -242,7 +242,7 @@ class Fitted:
 
         They are taken on the runs for validation, or on held-out blocks without such runs.
         """
-        found = self._tested() if self.tests else self._held_out
+        found = self._tested if self.tests else self._held_out
         names = measured_names(self.plant)
         return [
             {"state": name, "model": what, **error._asdict()}
@@ -251,6 +251,7 @@ class Fitted:
             for name, error in zip(names, row, strict=True)
         ]
 
+    @functools.cached_property
     def _tested(self) -> dict[str, list[Predicted]]:
         data = data_of(self.plant, self.tests, self.hold, self.data.deviations)
         history = 0.5 * self.selection.window
