@@ -11,10 +11,10 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
-from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import data_of
 from dopt.fitting.problem import Simulator
 from dopt.fitting.simulation import Data
@@ -52,11 +52,11 @@ class FittedTrial(MarkedTrial):
     Attributes
     ----------
     config_json : str
-        Canonical JSON of the marked configuration.
+        Canonical JSON of the marked configuration of a :class:`dopt.fitting.fitted.Fitted`.
     result : dopt.result.TrialResult
     """
 
-    def __init__(self, found: Fitted) -> None:
+    def __init__(self, found: Any) -> None:
         self.seed = 0
         rows, states, loss = _simulated(found)
         self._step = _step(found.data, rows)
@@ -103,7 +103,7 @@ def digest(data: Data) -> str:
     return found.hexdigest()
 
 
-def _simulated(found: Fitted) -> tuple[Integers, Array, Array]:
+def _simulated(found: Any) -> tuple[Integers, Array, Array]:
     """Return the fitted rows, (T + 1,), their states, (T + 1, d), and errors, (T + 1,)."""
     data, (model, solution, _, _) = found.data, found.chosen
     simulator, states = Simulator(model, data), np.full((len(data.time), model.d), np.nan)
@@ -122,7 +122,7 @@ def _step(data: Data, rows: Integers) -> float:
     return float(f"{np.median(steps):.9g}")
 
 
-def _result(found: Fitted, rows: Integers, states: Array, loss: Array, step: float) -> TrialResult:
+def _result(found: Any, rows: Integers, states: Array, loss: Array, step: float) -> TrialResult:
     n = len(rows) - 1
     unknown = np.full(n, np.nan)
     return TrialResult(
@@ -141,7 +141,7 @@ def _result(found: Fitted, rows: Integers, states: Array, loss: Array, step: flo
     )
 
 
-def _numbers(found: Fitted, n: int) -> Iterator[Assessment]:
+def _numbers(found: Any, n: int) -> Iterator[Assessment]:
     values = {"useful": found.useful(), "window": found.selection.window, "weight": found.chosen.s}
     for name, (value, error) in found.constants.items():
         values |= {f"constant.{name}": value, f"error.{name}": error}
@@ -153,7 +153,7 @@ def _numbers(found: Fitted, n: int) -> Iterator[Assessment]:
         yield Assessment(n, name, value)
 
 
-def _errors(found: Fitted, n: int, step: float) -> Iterator[Assessment]:
+def _errors(found: Any, n: int, step: float) -> Iterator[Assessment]:
     """Yield errors of predictions; horizons beyond the rows of the fit are left out."""
     values: dict[tuple[int, str], float] = {}
     for row in found.errors():
