@@ -14,6 +14,7 @@ from dopt.errors import given_path
 from dopt.log import Log
 from dopt.systems.plant import Plant
 from orchestrate.program import path, positive, tell
+from orchestrate.store import Store
 
 HELP = "fit a plant's unknown constants and a network to recorded runs: report, picture, model"
 
@@ -34,12 +35,19 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--window", type=positive("--window", float), help="window [s] (chosen)")
     command.add_argument("--out", type=path("--out"), default="fit", help="folder (fit/)")
+    command.add_argument(
+        "--db",
+        metavar="URL",
+        help="database that stores the fit, such as sqlite:///results.db (no database)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit, print the report, and save the picture and the model."""
+    """Fit, print the report, save the picture and the model, and store the fit where asked."""
     import dopt
 
+    if options.db:
+        Store.open(options.db).close()  # before minutes of fitting
     plant = read_plant(options.plant)
     given = {
         "columns": names_of("--columns", options.columns),
@@ -64,6 +72,8 @@ def run(options: argparse.Namespace) -> int:
     save(found, (tests or logs)[0], options.out / "fit.png")
     found.save(options.out / "model.npz")
     tell(sys.stdout, f"picture: {options.out / 'fit.png'}\nmodel: {options.out / 'model.npz'}\n")
+    if options.db:
+        tell(sys.stdout, f"trial: {found.store(options.db)}\n")
     return 0
 
 

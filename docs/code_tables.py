@@ -19,6 +19,7 @@ from analysis.cli import parser
 from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
+from dopt.fitting.stored import FIT_MEASURES
 from dopt.kernel import plugin
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System
@@ -178,8 +179,8 @@ def tables() -> str:
     )
 
 
-def measures() -> str:
-    rows = [[f"`{name}`", said] for name, said in MEASURES.items()]
+def measures(of: Mapping[str, str] = MEASURES) -> str:
+    rows = [[f"`{name}`", said] for name, said in of.items()]
     return markdown(["measure", "value"], rows)
 
 
@@ -262,6 +263,7 @@ def arguments(cls: type) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "plant_arguments": functools.partial(arguments, Plant),
     "explorer_arguments": functools.partial(arguments, Explorer),
+    "fit_measures": functools.partial(measures, FIT_MEASURES),
 }
 TABLES |= {
     made.__name__: made

@@ -25,7 +25,7 @@ from dopt.errors import SpecificationError
 from dopt.limits import Limits
 from dopt.registry import SOURCE, TARGET
 from dopt.spec.label import flatten
-from dopt.spec.trial import TrialSpec
+from dopt.spec.trial import TrialSpec, is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
 
 REFERENCE = "d_optimal"
@@ -288,8 +288,10 @@ def newest(configs: list[ConfigRow]) -> list[ConfigRow]:
     """Return the configurations of the newest code version: other versions' numbers do not mix.
 
     Configurations with a task: only the newest version of the assessments. Of configurations that
-    differ in the version of the plans' criterion alone, only the newest.
+    differ in the version of the plans' criterion alone, only the newest. Fits to recorded runs are
+    left out: they explored nothing.
     """
+    configs = [config for config in configs if not is_fit(config.config)]
     code = max((config.config.get("code_version", 0) for config in configs), default=0)
     assessment = max((_assessment_version(config) or 0 for config in configs), default=0)
     found = [

@@ -34,7 +34,7 @@ from analysis.style import policy_style
 from dopt.errors import SpecificationError
 from dopt.spec.config import completed
 from dopt.spec.label import flatten, labels
-from dopt.spec.trial import is_prequential, system_of
+from dopt.spec.trial import is_fit, is_prequential, system_of
 from dopt.systems import System
 from dopt.systems.properties import eigenmode
 from orchestrate.store import ConfigRow, LaunchRow, Reader, explorations, failure_kinds
@@ -103,6 +103,14 @@ WHERE launch_id IN (SELECT launch_id FROM attempt WHERE trial_id = :trial_id) OR
 _ASSESSED = """
 SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure
 """
+_FITS = """
+SELECT v.trial_key, v.config_key, v.model, v.width, v.n_steps, v.dt, l.started,
+       u.value AS useful, w.value AS "window"
+FROM v_trial v LEFT JOIN launch l ON l.launch_id = v.launch_id
+JOIN assessment u ON u.trial_id = v.trial_id AND u.measure = 'useful'
+JOIN assessment w ON w.trial_id = v.trial_id AND w.measure = 'window'
+WHERE v.policy = 'recorded' ORDER BY v.trial_id DESC
+"""
 _STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id ORDER BY t"
 
 
@@ -134,8 +142,9 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
     """Return every configuration with its final loss and trials, launches and failures."""
     reader = state.database.reader()
     progress = read_progress(reader)
-    stored = reader.configs()
+    stored = [config for config in reader.configs() if not is_fit(config.config)]
     configs = latest(reader, stored)
+    fits = reader.rows(_FITS)
     finals = state.selections.get_or_compute(
         ("final", reader, progress["token"]), lambda: _finals(reader)
     )
@@ -151,6 +160,7 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
             for env in _environments(configs)
         ],
         "older": len(stored) - len(configs),
+        "fits": [dict(zip(fits.columns, row, strict=True)) for row in fits],
         **_launches(reader),
     }
 
@@ -396,6 +406,7 @@ def trial(state: ServerState, params: QueryParams) -> Content:
     system = _system(config)
     running = next((one for one in explorations(reader) if one.trial_key == row["trial_key"]), None)
     launches = _table(reader, _LAUNCHES, row["trial_id"])
+    fit = _fit(reader, row, config)
     return {
         "progress": read_progress(reader),
         "trial": row,
@@ -404,7 +415,8 @@ def trial(state: ServerState, params: QueryParams) -> Content:
         "launches": [
             one | {name: json.loads(one[name]) for name in ("argv", "versions")} for one in launches
         ],
-        "assessments": _table(reader, _ASSESSED, row["trial_id"]),
+        "assessments": [] if fit else _table(reader, _ASSESSED, row["trial_id"]),
+        "fit": fit,
         "has_arrays": row["status"] in ("done", "diverged"),
         "exploration": running and {"is_running": running.is_running, "state": running.state},
         "system_is_known": system is not None,
@@ -432,6 +444,7 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
     return {
         **{name: [step[name] for step in steps] for name in ("t", *LOSSES)},
         "is_prequential": is_prequential(config),
+        "fit": _fit(reader, row, config),
         "legend_entry": legend_entry(row["policy"]),
         "dt": row["dt"],
         "gamma": row["gamma"],
@@ -445,6 +458,36 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
         ],
         "spectrum": _spectrum(inputs, row["dt"], system),
         "phase": _phase(states, system) if system else None,
+    }
+
+
+AHEAD = ("rms", "median", "physics", "linear", "unchanged")
+"""Errors of a fit's predictions (:data:`dopt.fitting.stored.FIT_MEASURES`)."""
+
+
+def _fit(reader: Reader, trial: Content, config: Content) -> Content | None:
+    """Return the numbers of a fit, None of another trial: constants with errors, and the others.
+
+    Errors of predictions have a row for each measured state and time ahead.
+    """
+    if not is_fit(config):
+        return None
+    errors: dict[tuple[str, int], Content] = {}
+    named: dict[str, float | None] = {}
+    for one in _table(reader, _ASSESSED, trial["trial_id"]):
+        kind, _, state = one["measure"].partition(".")
+        if kind in AHEAD:
+            row = {"state": state, "seconds": one["t"] * trial["dt"]}
+            errors.setdefault((state, one["t"]), row)[kind] = one["value"]
+        else:
+            named[one["measure"]] = one["value"]
+    names = [name.partition(".")[2] for name in named if name.startswith("constant.")]
+    return {
+        "constants": {
+            name: (named.pop(f"constant.{name}"), named.pop(f"error.{name}")) for name in names
+        },
+        "errors": [errors[key] for key in sorted(errors)],
+        "numbers": named,
     }
 
 

@@ -1,4 +1,4 @@
-"""Saves of an exploration to a results database: the one part of dopt that uses orchestrate."""
+"""Saves to a results database: the one part of dopt that uses orchestrate."""
 
 from __future__ import annotations
 
@@ -376,7 +376,7 @@ class SavedExplored(Explored):
         """
         with self._saving:
             if url not in self._savers:
-                self._savers[url] = _new_saver(url)
+                self._savers[url] = new_saver(url)
             try:
                 result = self._result(test)
                 trial = PrequentialTrial(self.spec)
@@ -436,12 +436,13 @@ def _close(savers: dict[str | None, ExplorationSaver]) -> None:
         savers.popitem()[1].close()
 
 
-def _new_saver(url: str | None) -> ExplorationSaver:
+def new_saver(url: str | None) -> ExplorationSaver:
+    """Return what writes to a database; raise ExplorationError without orchestrate."""
     try:
         from orchestrate.runner.saving import ExplorationSaver
     except ModuleNotFoundError as error:
         raise ExplorationError(
-            f"an exploration is saved by the package orchestrate, but {error.name} is not "
+            f"results are saved by the package orchestrate, but {error.name} is not "
             f"installed: install dopt with its dependencies."
         ) from error
     return ExplorationSaver(url)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +30,9 @@ from dopt.types import Array, Integers
 
 USEFUL = 0.5
 """Largest error of a model that is worth using, by the changes themselves."""
+
+TOLD_APART = 0.1
+"""Largest standard error of delay and lag that are told apart, by their sizes together."""
 
 
 class Estimate(NamedTuple):
@@ -98,6 +102,9 @@ class Fitted:
         self.data, self.chosen, self.physics = data, chosen, physics
         self._held_out = dict(held_out)
         self.has_network = chosen is not physics
+        if {"delay", "lag"} <= {*physics.model.names[physics.model.n_named :]}:
+            note = self._delay_and_lag()
+            self.selection = selection._replace(notes=(*selection.notes, note))
 
     @functools.cached_property
     def constants(self) -> dict[str, tuple[float, float]]:
@@ -108,6 +115,26 @@ class Fitted:
             name: (value, float(error))
             for (name, value), error in zip(values.items(), deviations, strict=True)
         }
+
+    def _delay_and_lag(self) -> str:
+        """Return in a sentence whether the data tell the delay from the lag.
+
+        Their errors decide: their correlation is near -1 also where both are known well.
+        """
+        model, solution, _, covariance = self.physics
+        last = model.named[-2:]
+        (delay, lag), slopes = (
+            [*part][-2:] for part in (self.constants.values(), model.named_values(solution.p)[1])
+        )
+        C = covariance[np.ix_(last, last)] * np.outer(slopes, slopes)
+        rho = C[0, 1] / max(math.sqrt(C[0, 0] * C[1, 1]), 1e-300)
+        both = f"(correlation {rho:.3f})"
+        if max(delay[1], lag[1]) <= TOLD_APART * (abs(delay[0]) + abs(lag[0])):
+            return f"the logs tell the delay and the lag apart {both}"
+        return (
+            f"the logs do not tell the delay and the lag apart {both}: what they give is the sum, "
+            f"{delay[0] + lag[0]:.4g} ± {math.sqrt(max(C.sum(), 0.0)):.2g} s; declare one of both"
+        )
 
     @property
     def given(self) -> dict[str, float]:
@@ -215,7 +242,7 @@ class Fitted:
 
         They are taken on the runs for validation, or on held-out blocks without such runs.
         """
-        found = self._tested() if self.tests else self._held_out
+        found = self._tested if self.tests else self._held_out
         names = measured_names(self.plant)
         return [
             {"state": name, "model": what, **error._asdict()}
@@ -224,6 +251,7 @@ class Fitted:
             for name, error in zip(names, row, strict=True)
         ]
 
+    @functools.cached_property
     def _tested(self) -> dict[str, list[Predicted]]:
         data = data_of(self.plant, self.tests, self.hold, self.data.deviations)
         history = 0.5 * self.selection.window
@@ -290,30 +318,73 @@ class Fitted:
 
     def verdict(self) -> str:
         """Return in a sentence how far ahead the model is worth using."""
-        rows = [row for row in self.errors() if row["model"] == "model"]
-        good = [
-            horizon
-            for horizon in sorted({row["horizon"] for row in rows})
-            if all(
-                row["rms"] < USEFUL * row["nothing_changes"]
-                for row in rows
-                if row["horizon"] <= horizon
-            )
-        ]
-        if not good:
+        useful, longest = self._useful()
+        if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
-        if len(good) < len({row["horizon"] for row in rows}):
-            return f"Do not use this model beyond {good[-1]:.2g} s."
-        return f"Useful up to {good[-1]:.2g} s, the longest time that was tried."
+        if useful < longest:
+            return f"Do not use this model beyond {useful:.2g} s."
+        return f"Useful up to {useful:.2g} s, the longest time that was tried."
+
+    def useful(self) -> float:
+        """Return how far ahead the model is worth using [s]; 0 for not at all."""
+        return self._useful()[0]
+
+    def _useful(self) -> tuple[float, float]:
+        """Return the longest time ahead that is worth using, and that was tried [s]."""
+        rows = [row for row in self.errors() if row["model"] == "model"]
+        horizons, useful = sorted({row["horizon"] for row in rows}), 0.0
+        for horizon in horizons:
+            here = [row for row in rows if row["horizon"] == horizon]
+            if not all(row["rms"] < USEFUL * row["nothing_changes"] for row in here):
+                break
+            useful = horizon
+        return useful, max(horizons, default=0.0)
 
     def report(self) -> str:
         """Return what was found, line by line, with units."""
         return report_of(self)
 
+    def store(self, url: str | None = None) -> str:
+        """Store the fit as a trial in the results database of the launches.
+
+        Its steps are the rows of the logs, its numbers assessments (:mod:`dopt.fitting.stored`).
+        What is stored of the same fit already is replaced.
+
+        Parameters
+        ----------
+        url : str, optional
+            Database, such as ``sqlite:///results.db``; by default the one a launch uses.
+
+        Returns
+        -------
+        str
+            Key of the trial.
+
+        Raises
+        ------
+        StoreError
+            If the database fails; what was stored stays.
+        ExplorationError
+            If the package orchestrate is not installed.
+        """
+        from dopt.explorer.saving import new_saver
+        from dopt.fitting.stored import FittedTrial
+
+        trial, saver = FittedTrial(self), new_saver(url)
+        try:
+            saver.save(trial, trial.result)
+        finally:
+            saver.close()
+        return trial.trial_key
+
     def save(self, path: str | Path) -> None:
-        """Write the model as arrays (.npz), which :func:`dopt.load_fit` and NumPy alone read."""
+        """Write the model as arrays (.npz), which NumPy alone reads (:meth:`store`: a database)."""
         from dopt.fitting.export import save
 
+        if "://" in str(path):
+            raise SpecificationError(
+                "path is the URL of a database, but a file is expected: give the URL to store()."
+            )
         save(self, path)
 
     def to_torch(self) -> Any:
@@ -397,10 +468,10 @@ def report_of(found: Fitted) -> str:
         for horizon in sorted({row["horizon"] for row in rows}):
             here = [row for row in rows if row["state"] == name and row["horizon"] == horizon]
             models = ", ".join(f"{row['model']} {row['rms']:.3g}" for row in here)
-            first = here[0]
+            best = next(row for row in here if row["model"] == "model")
             lines.append(
-                f"    {horizon:.3g} s: {models}, nothing changes {first['nothing_changes']:.3g}; "
-                f"median {first['median']:.3g}"
+                f"    {horizon:.3g} s: {models}, nothing changes {best['nothing_changes']:.3g}; "
+                f"median of the model {best['median']:.3g}"
             )
     lines.append("")
     for name, share in found.coverage().items():

@@ -12,7 +12,6 @@ import functools
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -303,11 +302,23 @@ _EXAMPLES["plant"] = "real"
 MARK = {"loss": "prequential"}
 """Entry of the section ``env`` that marks an exploration, beside the fields of its system."""
 
+FIT_MARK = {"loss": "simulation"}
+"""The same of a fit to recorded runs."""
+
 
 def is_prequential(config: Mapping[str, Any]) -> bool:
     """Return whether a stored configuration belongs to an exploration."""
+    return _has_mark(config, MARK)
+
+
+def is_fit(config: Mapping[str, Any]) -> bool:
+    """Return whether a stored configuration belongs to a fit to recorded runs."""
+    return _has_mark(config, FIT_MARK)
+
+
+def _has_mark(config: Mapping[str, Any], mark: Mapping[str, str]) -> bool:
     section = config.get("env")
-    return isinstance(section, Mapping) and MARK.items() <= section.items()
+    return isinstance(section, Mapping) and mark.items() <= section.items()
 
 
 def stored_trial(config: Mapping[str, Any], seed: int = 0) -> TrialSpec:
@@ -326,33 +337,16 @@ def system_of(config: Mapping[str, Any]) -> System:
 
 def _checked(config: Mapping[str, Any]) -> dict[str, Any]:
     check_stored(config)
-    if not is_prequential(config):
+    if not (is_prequential(config) or is_fit(config)):
         return dict(config)
     return {**config, "env": {k: v for k, v in config["env"].items() if k not in MARK}}
 
 
-@dataclass(frozen=True)
-class PrequentialTrial:
-    """An exploration as the trial that a results database holds.
+class MarkedTrial:
+    """What a results database holds as a trial, although no launch can run it."""
 
-    Attributes
-    ----------
-    spec : TrialSpec
-        Plant or system, policy, model, learner and seed.
-    """
-
-    spec: TrialSpec
-
-    @property
-    def seed(self) -> int:
-        return self.spec.seed
-
-    @functools.cached_property
-    def config_json(self) -> str:
-        """Canonical JSON of the marked configuration."""
-        content = json.loads(self.spec.config_json)
-        content["env"] |= MARK
-        return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    seed: int
+    config_json: str
 
     @functools.cached_property
     def config_key(self) -> str:
@@ -364,6 +358,28 @@ class PrequentialTrial:
         """SHA-256 of the marked configuration with the seed."""
         text = f'{self.config_json[:-1]},"seed":{self.seed}}}'
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def marked_json(content: Mapping[str, object]) -> str:
+    """Return the canonical JSON of a marked configuration."""
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+class PrequentialTrial(MarkedTrial):
+    """An exploration as the trial that a results database holds.
+
+    Attributes
+    ----------
+    spec : TrialSpec
+        Plant or system, policy, model, learner and seed.
+    config_json : str
+        Canonical JSON of the marked configuration.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        content = json.loads(spec.config_json)
+        content["env"] |= MARK
+        self.spec, self.seed, self.config_json = spec, spec.seed, marked_json(content)
 
     def columns(self) -> dict[str, str | int | float | None]:
         """Return what a table of configurations shows in columns of its own."""

@@ -135,7 +135,8 @@ def _noise(given: float | Encoder) -> float:
 def _section_of(given: Any) -> Any:
     """Return a number, or a mapping for an unknown or an encoder."""
     if isinstance(given, Unknown | Encoder):
-        return {name: float(value) for name, value in dataclasses.asdict(given).items() if value}
+        parts = dataclasses.asdict(given).items()
+        return {name: float(part) for name, part in parts if part or name == "value"}
     return float(given)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import os
 import platform
 import socket
@@ -206,7 +207,7 @@ _log = logging.getLogger("dopt.explorer")
 
 
 class ExplorationSaver:
-    """Launch that one process saves one exploration in; any thread may save.
+    """Launch that one process saves one exploration or fit in; any thread may save.
 
     Parameters
     ----------
@@ -229,7 +230,9 @@ class ExplorationSaver:
         self._last: Saved | None = None
 
     def save(self, spec: Registrable, result: TrialResult) -> bool:
-        """Write an exploration; return False if the database holds more steps of it.
+        """Write an exploration or a fit; return False if the database holds more steps of it.
+
+        ``wall_seconds`` of the result may be NaN, where the duration is not known.
 
         Raises
         ------
@@ -252,7 +255,8 @@ class ExplorationSaver:
             self._launch = store.begin_launch(self._record)
             self._alive.enter_context(Heartbeat(store, self._launch, LEASE_SECONDS))
         last, self._last = self._last, None  # whether a save that fails has written is unknown
-        started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
+        known = result.wall_seconds if math.isfinite(result.wall_seconds) else 0.0
+        started = datetime.now(UTC) - timedelta(seconds=known)
         run = record_of(started, result.wall_seconds, result.cpu_seconds)
         self._last = store.save(self._launch, spec, result, run, last)
         return self._last is not None

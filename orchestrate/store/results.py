@@ -46,6 +46,7 @@ from orchestrate.store.schema import (
     ENDED,
     FINISHED,
     OUTCOME_COLUMNS,
+    PREQUENTIAL,
     RUN_COLUMNS,
     STEP_VALUES,
     assessment,
@@ -390,7 +391,7 @@ def save(
     run: RunRecord,
     last: Saved | None,
 ) -> Saved | None:
-    """Write an exploration and return what the next save appends to.
+    """Write an exploration or a fit, and return what the next save appends to.
 
     Where the database holds more steps of it, nothing is written and None is returned. Raises
     ``StoreError`` if the database holds another exploration of the same key.
@@ -415,10 +416,12 @@ def save(
 
 
 def is_longer(connection: Connection, backend: Backend, spec: Registrable, result: Result) -> bool:
-    """Return True if the stored exploration has more steps.
+    """Return True if the stored exploration has more steps; a fit is always written again whole.
 
     Raises ``StoreError`` if it holds another exploration of the same key.
     """
+    if PREQUENTIAL.strip("%") not in spec.config_json:
+        return False
     statement = (
         select(trajectory)
         .join(trial, trial.c.trial_id == trajectory.c.trial_id)

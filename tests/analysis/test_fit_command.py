@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from analysis import cli
+from orchestrate.store import Reader
 from tests.dopt.fitting.test_simulation import stamps, truth
 
 PAGE = Path(__file__).parents[2] / "docs/fitting.md"
@@ -38,9 +39,10 @@ def run(tmp_path: Path) -> Path:
 def test_the_plant_of_the_page_is_fitted(
     plant: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
+    out, url = tmp_path / "out", f"sqlite:///{tmp_path}/results.db"
     columns = ("--columns", "angle=th,voltage=u")
     words = ["fit", str(plant), str(run), "--validate", str(run), *columns, "--width", "3"]
+    words += ["--db", url]
     assert cli.main([*words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     gain = re.search(r"gain +(\S+) ± (\S+)", said)
@@ -50,6 +52,12 @@ def test_the_plant_of_the_page_is_fitted(
         assert expected in said, expected
     assert (out / "fit.png").stat().st_size > 10_000
     assert np.load(out / "model.npz")["constants"].shape == (4,)
+    with Reader.open(url) as reader:
+        [stored] = reader.rows(
+            "SELECT trial_key, value FROM v_assessment WHERE measure = 'constant.gain'"
+        )
+    assert stored.value == pytest.approx(float(gain[1]), rel=1e-4)
+    assert f"trial: {stored.trial_key}" in said
 
 
 @pytest.mark.parametrize(
@@ -67,6 +75,16 @@ def test_a_file_that_is_no_plant_is_refused(
     file.write_text(text, encoding="utf-8")
     assert cli.main(["fit", str(file), str(run)]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_database_that_cannot_be_used_is_said_before_the_fit(
+    plant: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["fit", str(plant), str(run), "--columns", "angle=th,voltage=u", "--db", "results.db"]
+    assert cli.main([*words, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert "write it as sqlite:///results.db" in said.err
+    assert not said.out
 
 
 def test_a_field_that_is_none_is_named(

@@ -19,16 +19,23 @@ from tests.dopt.fitting.test_simulation import pendulum, stamps, truth
 TRUE = (24.0, 1.4, 33.0, 0.1)
 
 
-def run(seed: int, n: int = 1200, delay: float = 0.02, drag: float = 0.0) -> pd.DataFrame:
-    """Return a run whose angle is measured in steps of a turn of 4,096 counts."""
+def run(
+    seed: int,
+    n: int = 1200,
+    delay: float = 0.02,
+    drag: float = 0.0,
+    lag: float = 0.0,
+    counts: int = 4096,
+) -> pd.DataFrame:
+    """Return a run whose angle is measured in steps of a turn of so many counts."""
     rng = np.random.default_rng(seed)
     t, u = stamps(rng, n, 0.0), np.repeat(rng.uniform(-2.5, 2.5, n // 6), 6)
     x = (
-        truth(t, u, delay, 0, np.array([0.0, 0.0]), TRUE)
+        truth(t, u, delay, lag, np.array([0.0, 0.0]), TRUE)
         if not drag
         else dragged(t, u, delay, drag)
     )
-    quantum = 2 * math.pi / 4096
+    quantum = 2 * math.pi / counts
     return pd.DataFrame({"time": t, "angle": np.round(x[:, 0] / quantum) * quantum, "voltage": u})
 
 
@@ -153,6 +160,33 @@ def test_the_environment_goes_as_the_simulation(fitted: Fitted) -> None:
 def test_a_given_delay_that_does_not_fit_is_said() -> None:
     found = dopt.fit(declared(delay=0.0), run(3), width=0)
     assert any("declare a delay of 0.02 s" in note for note in found.selection.notes)
+
+
+@pytest.mark.parametrize(
+    ("lag", "counts", "said"), [(0.08, 4096, "the logs tell"), (0.005, 60, "the logs do not tell")]
+)
+def test_the_report_says_whether_delay_and_lag_are_told_apart(
+    lag: float, counts: int, said: str
+) -> None:
+    """A lag of four samples is; a quarter of a sample, seen in steps of 6°, is not."""
+    unknown = {"delay": dopt.unknown(0.0, spread=0.03), "lag": dopt.unknown(0.03, factor=3)}
+    plant = declared(measured={"angle": dopt.encoder(counts)}, **unknown)
+    found = dopt.fit(plant, run(0, lag=lag, counts=counts), width=0)
+    [note] = [note for note in found.selection.notes if "apart" in note]
+    assert note.startswith(said)
+    assert f"note: {note}" in found.report()
+    (delay, _), (late, _) = found.constants["delay"], found.constants["lag"]
+    assert delay + late == pytest.approx(0.02 + lag, abs=2e-3), "their sum is known in both cases"
+
+
+def test_the_median_of_the_report_is_of_the_model(fitted: Fitted) -> None:
+    [row, *_] = [row for row in fitted.errors() if row["model"] == "model"]
+    assert f"median of the model {row['median']:.3g}\n" in fitted.report()
+
+
+def test_a_url_is_no_file(fitted: Fitted) -> None:
+    with pytest.raises(SpecificationError, match=r"give the URL to store\(\)"):
+        fitted.save("sqlite:///results.db")
 
 
 def test_units_of_a_state_do_not_matter() -> None:

@@ -13,12 +13,28 @@ function line(found, label, values, place = 0, among = 1, more = {}) {
 }
 
 function drawLoss(found) {
-  const grid = line(found, found.is_prequential ? "prequential loss" : "evaluation grid", found.loss);
+  const own = found.is_prequential ? "prequential loss" : found.fit && "error";
+  const grid = line(found, own || "evaluation grid", found.loss);
   const reachable = line(found, "reachable set", found.reachable_loss, 0, 1, { dash: [5, 4] });
-  const label = ["time t [steps]", found.is_prequential ? "prequential loss" : "L² error"];
+  const label = ["time t [steps]", own || "L² error"];
   const range = () => logRange([...found.loss, ...found.reachable_loss]);
-  const lines = found.is_prequential ? [grid] : [grid, reachable];
+  const lines = own ? [grid] : [grid, reachable];
   draw(part("loss"), { x: found.t, lines, label, log: [false, true], range, title: (i) => `t = ${found.t[i]}` });
+}
+
+/** Draw errors of a fit's predictions, relative to the changes of the states. */
+function drawAhead(rows) {
+  const x = [...new Set(rows.map((row) => row.seconds))].sort((a, b) => a - b);
+  const states = [...new Set(rows.map((row) => row.state))];
+  const kinds = [["rms", "model", []], ["physics", "constants alone", [5, 4]], ["linear", "linear", [2, 3]]];
+  const at = (state, seconds) => rows.find((row) => row.state === state && row.seconds === seconds) ?? {};
+  const share = (row, kind) => (row[kind] && row.unchanged ? row[kind] / row.unchanged : null);
+  const lines = states.flatMap((state, i) =>
+    kinds.map(([kind, name, dash]) => ({ label: `${state}, ${name}`, values: x.map((s) => share(at(state, s), kind)), colour: PAINTS[i % PAINTS.length], dash, line_width: 1 })),
+  );
+  const range = () => logRange(lines.flatMap((one) => one.values));
+  draw(part("ahead"), { x, lines, label: ["time ahead [s]", "error / change"], log: [true, true], range, title: (i) => `${numeral(x[i])} s ahead` });
+  nameLines(part("ahead-legend"), lines);
 }
 
 /** Draw quantities against time, bounds dashed. */
@@ -118,6 +134,7 @@ async function load() {
     const found = await answer.json();
     if (!answer.ok) throw new Error(found.error);
     drawLoss(found);
+    if (found.fit) drawAhead(found.fit.errors);
     drawTimes("inputs", found, found.inputs, 0);
     const names = found.inputs.length > 1 ? "Bound of the norm" : "Bound";
     part("inputs-note").textContent = `${names}: γ = ${numeral(found.gamma, 3)}.`;
