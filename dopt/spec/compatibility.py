@@ -115,10 +115,9 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
         if not isinstance(system, ExploredPlant):
             expected = "a dopt.Plant that a dopt.Explorer explores"
             raise mismatch(f"learner '{learner.name}'", expected, f"env '{system.name}'")
-        if type(model) is not MLP or model.depth != 1:
-            expected = "model 'mlp' with model.depth 1"
-            depth = f" with model.depth {model.depth}" if isinstance(model, MLP) else ""
-            raise mismatch(f"learner '{learner.name}'", expected, f"{given}{depth}")
+        if isinstance(model, MLP) and model.depth != 1:
+            shown = f"model.depth {model.depth}"
+            raise mismatch(f"learner '{learner.name}'", "model.depth 1", shown)
     _check_sensors(system, learner)
     _check_model(system, policy, model, learner)
     _check_inputs(system, policy, model, learner)
@@ -217,6 +216,8 @@ def _teaches(learner: type[Learner], model: type[Model]) -> bool:
 
     A filter also learns physical parameters, and a learner that refits also fits ensembles.
     """
+    if issubclass(learner, SimulationError):
+        return model is MLP
     filtered = issubclass(learner, ExtendedKalman | JointKalman) and issubclass(model, Linear)
     fitted = issubclass(learner, GaussNewton) and issubclass(model, Ensemble)
     return filtered or fitted or learner.structure == model.structure

@@ -240,7 +240,7 @@ def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
             "recursive_least_squares",
             "learner 'recursive_least_squares' goes with model 'linear', 'linear_state' or 'rff' "
             "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf', "
-            "'gauss_newton' or 'joint_ekf', but",
+            "'gauss_newton', 'joint_ekf' or 'simulation_error', but",
         ),
     ],
 )

@@ -237,8 +237,10 @@ def test_what_it_cannot_fit_is_refused() -> None:
         TrialSpec.from_names(
             "pendulum", "d_optimal", learner="simulation_error", model={"name": "mlp", "depth": 1}
         )
-    with pytest.raises(IncompatibleError, match=r"model.depth 1, but .* with model.depth 2"):
+    with pytest.raises(IncompatibleError, match=r"goes with model.depth 1, but model.depth 2"):
         explorer(model="mlp")
+    with pytest.raises(IncompatibleError, match="goes with model 'mlp' and model 'affine'"):
+        explorer(model={"name": "affine", "depth": 1})
     with pytest.raises(IncompatibleError, match="kernel alone"):
         explorer(path="reference")
     with pytest.raises(SpecificationError, match="growth"):
