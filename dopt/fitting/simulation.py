@@ -5,7 +5,8 @@ inputs, c the constants, N a network of one layer of tanh units, and A the sizes
 input that is recorded at time T acts from T + D on, held until the next one; an actuator of first
 order follows it, dv/dt = (u - v)/τ, which is integrated exactly. The state is integrated by the
 method of Runge and Kutta of fourth order, from one switch of the input to the next, and with it
-its derivatives by the parameters and the initial state:
+its derivatives by the parameters and the initial state. They are derivatives of the method itself:
+a step makes S to F S + Σ W ∂f/∂p, over its four stages.
 
 ======  ======================================================================  =========
 symbol  meaning                                                                 shape
@@ -136,7 +137,7 @@ class Work(NamedTuple):
     W: types.Array  # (4, d, d) ∂(state after the step)/∂(f at a stage)
     F: Matrix  # (d, d) ∂(state after the step)/∂(state before it)
     S: Matrix  # (d, q + d)
-    next_S: Matrix
+    moved: Matrix  # S after a step
     phi: Vector
     dphi: Vector
     hidden: Vector
@@ -172,9 +173,7 @@ def _dot(a: Vector, b: Vector) -> float:
 
 
 @_inlined
-def _network(
-    structure: Structure, values: Values, work: Work, stage: int, sensitive: bool
-) -> None:
+def _network(structure: Structure, values: Values, work: Work, stage: int, sensitive: bool) -> None:
     """Add the network to f, and where wanted its derivatives to A and P."""
     w, p = structure.width, structure.feature_kinds.shape[0]
     r, theta = structure.learned.shape[0], values.weights
@@ -281,7 +280,7 @@ def _advance(structure: Structure, work: Work, h: float) -> None:
                 for k in range(d):
                     F[i, j] += W[stage, i, k] * A[stage, k, j]
     for i in range(d):
-        out, S, factor = work.next_S[i], work.S[i], F[i, i]
+        out, S, factor = work.moved[i], work.S[i], F[i, i]
         for c in range(out.shape[0]):
             out[c] = factor * S[c]
         for j in range(d):
@@ -294,7 +293,7 @@ def _advance(structure: Structure, work: Work, h: float) -> None:
             w0, w1, w2, w3 = W[0, i, k], W[1, i, k], W[2, i, k], W[3, i, k]
             for c in range(q):
                 out[c] += w0 * P0[c] + w1 * P1[c] + w2 * P2[c] + w3 * P3[c]
-    _copy(work.next_S, work.S)
+    _copy(work.moved, work.S)
 
 
 @_inlined
