@@ -89,7 +89,11 @@ class _Chain:
         raise TypeError(ast.unparse(node))
 
     def _operation(
-        self, kind: type, left: tuple[str, Slopes], right: tuple[str, Slopes], power: ast.expr
+        self,
+        kind: type[ast.operator],
+        left: tuple[str, Slopes],
+        right: tuple[str, Slopes],
+        power: ast.expr,
     ) -> tuple[str, Slopes]:
         (a, da), (b, db) = left, right
         out = self._named(f"{a} {_SYMBOLS[kind]} {b}")

@@ -18,7 +18,7 @@ from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
 from dopt.systems.expressions import compiled_text
 from dopt.systems.plant import Encoder, Plant, Unknown
-from dopt.types import Array, CompiledFunction, Equation, Integers
+from dopt.types import Array, CompiledFunction, Equation, Integers, NumbaType
 
 _KINDS = {"identity": 0, "cos": 1, "sin": 2}
 
@@ -45,18 +45,19 @@ def compiled_known(key: PlantKey) -> Known:
     texts = {f"known['{name}']": plant.known.get(name, "0.0") for name in plant.states}
     equation = compiled_text(texts, groups, plant.guesses)
     by = [*plant.states, *plant.inputs, *unknown_of(plant)]
-    into, where = differentiated_text([*texts.values()], groups, [])
-    both, where = differentiated_text([*texts.values()], groups, by)
+    values, _ = differentiated_text([*texts.values()], groups, [])
+    derivatives, where = differentiated_text([*texts.values()], groups, by)
     driven = np.flatnonzero(where[:, len(plant.states) :].any(axis=1))
-    if PLAIN:
-        return Known(into, both, driven, equation)
-    codes = []
-    for function, signature in ((into, KNOWN), (both, DERIVATIVES)):
+
+    def compiled(function: CompiledFunction, signature: NumbaType) -> CompiledFunction:
+        if PLAIN:
+            return function
         code = numba.njit(error_model="numpy", fastmath=False)(function)
         code.compile(signature.args)
         code.disable_compile()
-        codes.append(code)
-    return Known(*codes, driven, equation)
+        return code
+
+    return Known(compiled(values, KNOWN), compiled(derivatives, DERIVATIVES), driven, equation)
 
 
 def unknown_of(plant: Plant) -> dict[str, Unknown]:
