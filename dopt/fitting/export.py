@@ -21,8 +21,7 @@ def save(found: Any, path: str | Path) -> None:
     """
     model, p = found.chosen.model, found.chosen.solution.p
     values, s, plant = model.values(p), model.structure, found.plant
-    w, n, r = model.width, len(s.feature_kinds), len(s.learned)
-    weights = values.weights
+    W1, b1, W2, b2 = model.matrices(values.weights)
     np.savez(
         Path(path).with_suffix(".npz"),
         states=np.array([*plant.states]),
@@ -35,10 +34,10 @@ def save(found: Any, path: str | Path) -> None:
         feature_indices=s.feature_indices,
         feature_centers=s.feature_centers,
         feature_scales=s.feature_scales,
-        W1=weights[: w * n].reshape(w, n),
-        b1=weights[w * n : w * n + w],
-        W2=weights[w * n + w : w * n + w + r * w].reshape(r, w),
-        b2=weights[w * n + w + r * w :] if w else np.zeros(r),
+        W1=W1,
+        b1=b1,
+        W2=W2,
+        b2=b2,
         sizes=values.sizes,
         delay=values.delay,
         lag=values.lag,
@@ -64,11 +63,9 @@ def to_torch(found: Any) -> Any:
             first = torch.nn.Linear(n, w, dtype=torch.float64)
             last = torch.nn.Linear(w, r, dtype=torch.float64)
             with torch.no_grad():
-                parts = np.split(values.weights, np.cumsum([w * n, w, r * w]))
-                for tensor, part in zip(
-                    (first.weight, first.bias, last.weight, last.bias), parts, strict=True
-                ):
-                    tensor.copy_(torch.tensor(part).reshape(tensor.shape))
+                tensors = (first.weight, first.bias, last.weight, last.bias)
+                for tensor, part in zip(tensors, model.matrices(values.weights), strict=True):
+                    tensor.copy_(torch.tensor(part))
             self.network = torch.nn.Sequential(first, torch.nn.Tanh(), last) if w else None
             self.register_buffer("sizes", torch.tensor(values.sizes))
             self.register_buffer("centers", torch.tensor(s.feature_centers))

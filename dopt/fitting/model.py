@@ -11,14 +11,14 @@ import numba
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.fitting.simulation import COMPLEX_KNOWN, Data, Structure, Values, Work, work_for
-from dopt.kernel.compiler import compilable
-from dopt.kernel.equations import KNOWN, as_tuple
+from dopt.fitting.derivatives import differentiated_text
+from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values, Work, work_for
+from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
 from dopt.systems.expressions import compiled_text
 from dopt.systems.plant import Encoder, Plant, Unknown
-from dopt.types import Array, CompiledFunction, Equation
+from dopt.types import Array, CompiledFunction, Equation, Integers, NumbaType
 
 _KINDS = {"identity": 0, "cos": 1, "sin": 2}
 
@@ -28,30 +28,41 @@ FINEST = 0.004
 """Longest part of a sample over which a linearly interpolated input is taken as constant [s]."""
 
 
+class Known(NamedTuple):
+    """The known part of a plant, compiled."""
+
+    values: CompiledFunction  # (x, v, c, f)
+    derivatives: CompiledFunction  # (x, v, c, f, G), with G of Work
+    driven: Integers  # rows that constants or inputs change
+    equation: Equation
+
+
 @functools.lru_cache(maxsize=64)
-def compiled_known(key: PlantKey) -> tuple[CompiledFunction, CompiledFunction, Equation]:
-    """Compile the known part of a plant for real and for complex numbers."""
+def compiled_known(key: PlantKey) -> Known:
+    """Compile the known part of a plant, and its derivatives."""
     plant = key.plant
     groups = {"states": [*plant.states], "inputs": [*plant.inputs], "constants": [*plant.constants]}
     texts = {f"known['{name}']": plant.known.get(name, "0.0") for name in plant.states}
     equation = compiled_text(texts, groups, plant.guesses)
-    d, m, c = (len(group) for group in groups.values())
-    function = compilable(equation)
+    by = [*plant.states, *plant.inputs, *unknown_of(plant)]
+    values, _ = differentiated_text([*texts.values()], groups, [])
+    derivatives, where = differentiated_text([*texts.values()], groups, by)
+    driven = np.flatnonzero(where[:, len(plant.states) :].any(axis=1))
 
-    def into(x: Array, u: Array, p: Array, out: Array) -> None:
-        values = function(as_tuple(x, d), as_tuple(u, m), as_tuple(p, c))
-        for i in range(len(values)):
-            out[i] = values[i]
-
-    if PLAIN:
-        return into, into, equation
-    both = []
-    for signature in (KNOWN, COMPLEX_KNOWN):
-        code = numba.njit(error_model="numpy", fastmath=False)(into)
+    def compiled(function: CompiledFunction, signature: NumbaType) -> CompiledFunction:
+        if PLAIN:
+            return function
+        code = numba.njit(error_model="numpy", fastmath=False)(function)
         code.compile(signature.args)
         code.disable_compile()
-        both.append(code)
-    return both[0], both[1], equation
+        return code
+
+    return Known(compiled(values, KNOWN), compiled(derivatives, DERIVATIVES), driven, equation)
+
+
+def unknown_of(plant: Plant) -> dict[str, Unknown]:
+    """Return the unknown constants of a plant."""
+    return {k: v for k, v in plant.constants.items() if isinstance(v, Unknown)}
 
 
 class PlantKey:
@@ -59,7 +70,7 @@ class PlantKey:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        groups = (plant.states, plant.inputs, plant.constants)
+        groups = (plant.states, plant.inputs, plant.constants, unknown_of(plant))
         self._key = (*map(tuple, groups), tuple(plant.known.items()))
 
     def __hash__(self) -> int:
@@ -105,19 +116,19 @@ class Model:
     ) -> None:
         self.plant, self.width, self.layout, self.delay = plant, width, layout, delay
         system = plant.system(1)
-        self.d, self.m, self.c = len(plant.states), len(plant.inputs), len(plant.constants)
-        real, complex_, self.equation = compiled_known(PlantKey(plant))
-        constants = list(plant.constants.items())
-        self.unknown = {k: v for k, v in constants if isinstance(v, Unknown)}
-        places = [i for i, (_, value) in enumerate(constants) if isinstance(value, Unknown)]
+        self.d, self.m = len(plant.states), len(plant.inputs)
+        known = compiled_known(PlantKey(plant))
+        self.equation, self.unknown = known.equation, unknown_of(plant)
+        places = [i for i, name in enumerate(plant.constants) if name in self.unknown]
         features = system.features
         p, r = len(features), len(system.learned_rows)
         layout = layout or Layout(np.zeros(p), np.ones(p), np.ones(r))
         measured = [i for i, name in enumerate(plant.states) if name in measured_names(plant)]
         self.rates = rates_of(plant, measured)
         self.structure = Structure(
-            known=real,
-            complex_known=complex_,
+            known=known.values,
+            derivatives=known.derivatives,
+            driven=np.union1d(known.driven, system.learned_rows if width else []).astype(np.int64),
             unknown=np.array(places, np.int64),
             learned=np.array(system.learned_rows, np.int64),
             feature_kinds=np.array([_KINDS[f.kind] for f in features], np.int64),
@@ -135,8 +146,9 @@ class Model:
         self._guesses = np.array([*plant.guesses.values()], float)
         n_weights = (p + 1) * width + (width + 1) * r if width else 0
         weights = np.zeros(n_weights)
-        drawn = np.random.default_rng(seed).standard_normal((p + 1) * width)
-        weights[: len(drawn)] = drawn  # the output layer begins at zero
+        rng = np.random.default_rng(seed)
+        inner = rng.standard_normal((width, p)).T.ravel(), rng.standard_normal(width)
+        weights[: (p + 1) * width] = np.concatenate(inner)  # the output layer begins at zero
         self.n_named, self.n_weights = len(places), n_weights
         times = np.zeros(int(free_delay) + int(free_lag))
         self.prior = np.concatenate([np.zeros(len(places)), weights, times])
@@ -221,22 +233,25 @@ class Model:
 
     def network(self, weights: Array, states: Array) -> Array:
         """Return the accelerations of the network, (N, r), at states, (N, d)."""
-        s, w = self.structure, self.width
-        p, r = len(s.feature_kinds), len(s.learned)
+        s, (W1, b1, W2, b2) = self.structure, self.matrices(weights)
         x = states[:, s.feature_indices]
         scaled = (x - s.feature_centers) / s.feature_scales
         phi = np.select(
             [s.feature_kinds == 1, s.feature_kinds == 2], [np.cos(x), np.sin(x)], scaled
         )
-        W1, b1 = weights[: w * p].reshape(w, p), weights[w * p : w * p + w]
-        W2 = weights[w * p + w : w * p + w + r * w].reshape(r, w)
-        out: Array = (np.tanh(phi @ W1.T + b1) @ W2.T + weights[-r:]) * self.sizes
+        out: Array = (np.tanh(phi @ W1.T + b1) @ W2.T + b2) * self.sizes
         return out
+
+    def matrices(self, weights: Array) -> tuple[Array, Array, Array, Array]:
+        """Return W₁, (w, p), b₁, (w,), W₂, (r, w), and b₂, (r,), of the network."""
+        w, p, r = self.width, len(self.structure.feature_kinds), len(self.sizes)
+        W1, b1, W2, b2 = np.split(weights, np.cumsum([w * p, w, r * w]))
+        return W1.reshape(p, w).T, b1, W2.reshape(r, w), b2 if w else np.zeros(r)
 
     def work(self, columns: int) -> Work:
         """Return arrays of one simulation, with so many columns of S."""
-        sizes = (len(self.structure.feature_kinds), self.structure.width)
-        return work_for(self.d, self.m, columns, self.c, *sizes)
+        sizes = (len(self.unknown), len(self.structure.feature_kinds), self.structure.width)
+        return work_for(self.d, self.m, columns, *sizes)
 
 
 def measured_names(plant: Plant) -> tuple[str, ...]:

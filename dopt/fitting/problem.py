@@ -23,7 +23,7 @@ from scipy.linalg import blas, cho_factor, cho_solve
 
 from dopt.fitting import simulation
 from dopt.fitting.model import Model
-from dopt.fitting.simulation import COMPLEX_KNOWN, Data, Structure, Values
+from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
 from dopt.types import Array, Booleans, Integers
@@ -70,6 +70,11 @@ class Windows(NamedTuple):
             np.ascontiguousarray(self.rows[wanted]), np.ascontiguousarray(self.starts[wanted])
         )
 
+    @property
+    def longest(self) -> int:
+        """Most rows of a window."""
+        return int(np.max(self.rows[:, 1] - self.rows[:, 0], initial=-1)) + 1
+
     def counts(self, data: Data) -> Array:
         """Return how many numbers were measured in each."""
         seen = np.concatenate([[0], np.cumsum(np.isfinite(data.measured).sum(axis=1))])
@@ -84,7 +89,7 @@ class Simulator:
         self.model, self.data = model, data
         self.tolerance = simulation.TOGETHER * float(np.median(np.abs(np.diff(data.time))))
         self._dull, self._sharp = model.work(0), model.work(model.q + model.d)
-        self._starts = model.work(model.d)
+        self._starts, self._nothing = model.work(model.d), np.empty((0, model.d, 0))
         self.channels = len(model.structure.measured)
         self._times: tuple[float, ...] = ()
         self._filtered: tuple[Array, Array]
@@ -95,7 +100,7 @@ class Simulator:
         if times != self._times:
             N, m = self.data.inputs.shape
             v, dv = np.empty((N, m)), np.empty((N, m, 2))
-            call(simulation.filter_inputs, self.data, values, self.tolerance, v, dv)
+            call(simulation.filter_inputs, self.data, values, self.tolerance, self._dull, v, dv)
             self._times, self._filtered = times, (v, dv)
         return self._filtered
 
@@ -105,7 +110,7 @@ class Simulator:
         call(
             *(simulation.write_squares, self.model.structure, values, self.data),
             *(windows.rows, windows.starts, *self.filtered(values), self.tolerance),
-            *(self._dull, out),
+            *(self._dull, np.empty((windows.longest, self.model.d)), self._nothing, out),
         )
         return out
 
@@ -113,10 +118,9 @@ class Simulator:
         """Return simulated states, (rows, d), NaN from where they leave the limit."""
         values = self.model.values(p)
         out = np.full((last - first + 1, self.model.d), np.nan)
-        nothing = np.empty((0, self.model.d, 0))
         call(
             *(simulation.run, self.model.structure, values, self.data, first, last, start),
-            *(*self.filtered(values), self.tolerance, self._dull, False, out, nothing),
+            *(*self.filtered(values), self.tolerance, self._dull, False, out, self._nothing),
         )
         return out
 
@@ -180,6 +184,8 @@ class Simulator:
         each = np.zeros((k, q)) if scores else None
         roots = np.sqrt(weights)
         sizes = (windows.rows[:, 1] - windows.rows[:, 0] + 1) * self.channels
+        states, Q = np.empty((windows.longest, d)), np.empty((windows.longest * self.channels, d))
+        slopes = np.empty((windows.longest, d, q + d))
         for first, last in _batches(sizes):
             n = int(sizes[first:last].sum())
             R, e = np.empty((n, q)), np.empty(n)
@@ -187,7 +193,7 @@ class Simulator:
             call(
                 *(simulation.write_rows, model.structure, values, data, windows.rows[part]),
                 *(windows.starts[part], roots[part], v, dv, self.tolerance, work),
-                *(R, e, T[part], C[part], g[part], squares[part]),
+                *(states, slopes, Q, R, e, T[part], C[part], g[part], squares[part]),
             )
             if q:
                 normal = blas.dsyrk(1.0, R.T, beta=1.0, c=normal, overwrite_c=True)
@@ -319,7 +325,7 @@ def _code(function: Any, kinds: tuple[Any, ...]) -> Any:
 
 def _kind(value: Any) -> Any:
     if isinstance(value, Structure):
-        functions = [types.FunctionType(KNOWN), types.FunctionType(COMPLEX_KNOWN)]
+        functions = [types.FunctionType(KNOWN), types.FunctionType(DERIVATIVES)]
         return types.NamedTuple([*functions, *map(_kind, value[2:])], Structure)
     if isinstance(value, tuple):
         return types.NamedTuple([*map(_kind, value)], type(value))

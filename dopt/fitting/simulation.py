@@ -5,7 +5,8 @@ inputs, c the constants, N a network of one layer of tanh units, and A the sizes
 input that is recorded at time T acts from T + D on, held until the next one; an actuator of first
 order follows it, dv/dt = (u - v)/τ, which is integrated exactly. The state is integrated by the
 method of Runge and Kutta of fourth order, from one switch of the input to the next, and with it
-its derivatives by the parameters and the initial state:
+its derivatives by the parameters and the initial state. They are derivatives of the method itself:
+a step makes S to F S + Σ W ∂f/∂p, over its four stages.
 
 ======  ======================================================================  =========
 symbol  meaning                                                                 shape
@@ -42,28 +43,30 @@ from dopt.kernel.network import tanh
 from dopt.kernel.plain import PLAIN
 from dopt.types import CompiledFunction, Integers, Matrix, Vector
 
-COMPLEX_KNOWN = types.void(*[types.complex128[::1]] * 4)
+DERIVATIVES = types.void(*[types.float64[::1]] * 4, types.float64[:, ::1])
 
 _DIGEST = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
 
 
 def _inlined(function: CompiledFunction) -> CompiledFunction:
-    """Compile a function into its callers: a call would count references of all arrays."""
+    """Compile a function into its callers: a call would hand over each array of the structures."""
     if PLAIN:
         return function
     return numba.njit(error_model="numpy", fastmath=False, inline="always")(function)
 
 
 def _compiled(function: CompiledFunction) -> CompiledFunction:
+    """Compile a function without allocations, so without counts of references of arrays.
+
+    They take most of the time of a simulation: each use of an array of a structure counts.
+    """
     if PLAIN:
         return function
-    dispatcher = numba.njit(error_model="numpy", fastmath=False, nogil=True)(function)
+    options = {"error_model": "numpy", "fastmath": False, "nogil": True}
+    dispatcher = numba.njit(_nrt=False, **options)(function)
     dispatcher._cache = StoredCode(function, f"fitting-{_DIGEST}")
     return dispatcher
 
-
-STEP = 1e-30
-"""Imaginary part of a complex step."""
 
 TOGETHER = 1e-6
 """Part of a sample within which a switch of the input and a sample are at the same time."""
@@ -75,8 +78,9 @@ DEPENDENT = 1e-9
 class Structure(NamedTuple):
     """What is simulated, apart from the values of its parameters."""
 
-    known: CompiledFunction  # (x, v, c, out)
-    complex_known: CompiledFunction
+    known: CompiledFunction  # (x, v, c, f)
+    derivatives: CompiledFunction  # (x, v, c, f, G), with G of Work
+    driven: Integers  # rows of the state derivative that parameters or inputs change
     unknown: Integers  # (n,) places of the unknown constants in c
     learned: Integers  # (r,) rows of the state derivative with an output of the network
     feature_kinds: Integers  # (p,) 0: the state itself, 1: its cosine, 2: its sine
@@ -96,7 +100,7 @@ class Values(NamedTuple):
 
     constants: Vector  # c
     slopes: Vector  # (n,) derivatives of the unknown constants by their parameters
-    weights: Vector  # network: W₁ (w, p), b₁ (w), W₂ (r, w), b₂ (r)
+    weights: Vector  # network: W₁ᵀ (p, w), b₁ (w), W₂ (r, w), b₂ (r)
     sizes: Vector  # (r,) A
     delay: float  # D [s]
     lag: float  # τ [s]
@@ -116,46 +120,60 @@ class Data(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Arrays of one simulation."""
+    """Arrays of one simulation; the first index of A, P and W is a stage of a step."""
 
     x: Vector
     xs: Vector  # at a stage
     f: Vector
     sum_f: Vector
     other: Vector
-    v: Vector  # what acts of the input at a stage
-    A: Matrix  # (d, d) ∂f/∂x
-    B: Matrix  # (d, m) ∂f/∂v
-    P: Matrix  # (d, q + d) ∂f/∂p
+    now: Vector  # (m,) what acts of the input
+    dnow: Matrix  # (m, 2) its derivatives by delay and lag
+    v: Vector  # the same at a stage
+    dv: Matrix
+    G: Matrix  # (d, d + m + n) derivatives of the known part by x, v and the unknown constants
+    A: types.Array  # (4, d, d) ∂f/∂x
+    P: types.Array  # (4, d, q) ∂f/∂p
+    W: types.Array  # (4, d, d) ∂(state after the step)/∂(f at a stage)
+    F: Matrix  # (d, d) ∂(state after the step)/∂(state before it)
     S: Matrix  # (d, q + d)
-    Ss: Matrix
-    K: Matrix
-    sums: Matrix
-    zx: types.Array
-    zv: types.Array
-    zc: types.Array
-    zf: types.Array
+    moved: Matrix  # S after a step
     phi: Vector
     dphi: Vector
     hidden: Vector
+    slopes: Vector  # (w,) derivatives of an output by the arguments of the units
 
 
-def work_for(d: int, m: int, columns: int, c: int, p: int, w: int) -> Work:
+def work_for(d: int, m: int, columns: int, unknown: int, p: int, w: int) -> Work:
     """Return arrays of one simulation.
 
     S has q + d columns, d for the initial state alone, or 0 without sensitivities.
     """
-    n = columns
     vectors = [np.zeros(d) for _ in range(5)]
-    matrices = [np.zeros((d, n)) for _ in range(5)]
-    complexes = [np.zeros(size, np.complex128) for size in (d, m, c, d)]
-    of_inputs = (np.zeros(m), np.zeros((d, d)), np.zeros((d, m)))
-    of_network = (np.zeros(p), np.zeros(p), np.zeros(w))
-    return Work._make([*vectors, *of_inputs, *matrices, *complexes, *of_network])
+    of_inputs = [np.zeros(size) for size in (m, (m, 2), m, (m, 2), (d, d + m + unknown))]
+    of_stages = [np.zeros((4, d, n)) for n in (d, max(columns - d, 0), d)]
+    of_steps = (np.zeros((d, d)), np.zeros((d, columns)), np.zeros((d, columns)))
+    of_network = (np.zeros(p), np.zeros(p), np.zeros(w), np.zeros(w))
+    return Work._make([*vectors, *of_inputs, *of_stages, *of_steps, *of_network])
+
+
+@_compiled
+def _dot(a: Vector, b: Vector) -> float:
+    """Return the sum of products, of as many as b has: four sums, so that none waits for one."""
+    n = b.shape[0]
+    s0 = s1 = s2 = s3 = 0.0
+    for i in range(0, n - 3, 4):
+        s0 += a[i] * b[i]
+        s1 += a[i + 1] * b[i + 1]
+        s2 += a[i + 2] * b[i + 2]
+        s3 += a[i + 3] * b[i + 3]
+    for i in range(n - n % 4, n):
+        s0 += a[i] * b[i]
+    return (s0 + s1) + (s2 + s3)
 
 
 @_inlined
-def _network(structure: Structure, values: Values, work: Work, sensitive: bool) -> None:
+def _network(structure: Structure, values: Values, work: Work, stage: int, sensitive: bool) -> None:
     """Add the network to f, and where wanted its derivatives to A and P."""
     w, p = structure.width, structure.feature_kinds.shape[0]
     r, theta = structure.learned.shape[0], values.weights
@@ -172,93 +190,120 @@ def _network(structure: Structure, values: Values, work: Work, sensitive: bool) 
             phi[i], dphi[i] = (x - structure.feature_centers[i]) / scale, 1.0 / scale
     biases, second, last = w * p, w * p + w, w * p + w + r * w
     for j in range(w):
-        total = theta[biases + j]
-        for i in range(p):
-            total += theta[j * p + i] * phi[i]
-        h[j] = tanh(total)
-    first = structure.unknown.shape[0]
-    for k in range(r):
-        row, size = structure.learned[k], values.sizes[k]
-        total = theta[last + k]
+        h[j] = theta[biases + j]
+    for i in range(p):
+        of_feature = theta[i * w : (i + 1) * w]
         for j in range(w):
-            total += theta[second + k * w + j] * h[j]
-        work.f[row] += size * total
+            h[j] += of_feature[j] * phi[i]
+    for j in range(w):  # apart, so that several are done at once
+        h[j] = tanh(h[j])
+    for k in range(r):
+        row, size, outer = structure.learned[k], values.sizes[k], theta[second + k * w : last]
+        work.f[row] += size * (theta[last + k] + _dot(outer, h))
         if not sensitive:
             continue
-        out = work.P[row]
-        of_all = out.shape[0] > work.xs.shape[0]
-        if of_all:
-            out[first + last + k] = size
+        slopes = work.slopes
         for j in range(w):
-            slope = size * theta[second + k * w + j] * (1.0 - h[j] * h[j])
-            for i in range(p):
-                work.A[row, structure.feature_indices[i]] += slope * theta[j * p + i] * dphi[i]
-            if of_all:
-                out[first + second + k * w + j] = size * h[j]
-                out[first + biases + j] = slope
-                for i in range(p):
-                    out[first + j * p + i] = slope * phi[i]
+            slopes[j] = size * outer[j] * (1.0 - h[j] * h[j])
+        for i in range(p):
+            along = _dot(theta[i * w : (i + 1) * w], slopes) * dphi[i]
+            work.A[stage, row, structure.feature_indices[i]] += along
+        if work.P.shape[2] == 0:
+            continue
+        out = work.P[stage, row, structure.unknown.shape[0] :]
+        out[last + k] = size
+        by_bias, by_outer = out[biases:], out[second + k * w :]
+        for j in range(w):
+            by_bias[j] = slopes[j]
+            by_outer[j] = size * h[j]
+        for i in range(p):
+            by_inner = out[i * w : (i + 1) * w]
+            for j in range(w):
+                by_inner[j] = slopes[j] * phi[i]
 
 
 @_inlined
-def _rates(structure: Structure, values: Values, work: Work, sensitive: bool) -> None:
-    """Write f at the state ``xs`` under v, and where wanted A, B and P."""
-    d, m = work.xs.shape[0], work.v.shape[0]
-    structure.known(work.xs, work.v, values.constants, work.f)
+def _rates(structure: Structure, values: Values, work: Work, stage: int, sensitive: bool) -> None:
+    """Write f at the state ``xs`` under v, and where wanted A and P."""
+    d, m, q = work.xs.shape[0], work.v.shape[0], work.P.shape[2]
     if sensitive:
+        G, first = work.G, q - int(structure.free_delay) - int(structure.free_lag)
+        structure.derivatives(work.xs, work.v, values.constants, work.f, G)
         for i in range(d):
-            work.zx[i] = work.xs[i]
-        for i in range(m):
-            work.zv[i] = work.v[i]
-        for i in range(values.constants.shape[0]):
-            work.zc[i] = values.constants[i]
-        for j in range(d):
-            work.zx[j] += 1j * STEP
-            structure.complex_known(work.zx, work.zv, work.zc, work.zf)
-            work.zx[j] = work.xs[j]
-            for i in range(d):
-                work.A[i, j] = work.zf[i].imag / STEP
-        for j in range(m):
-            work.zv[j] += 1j * STEP
-            structure.complex_known(work.zx, work.zv, work.zc, work.zf)
-            work.zv[j] = work.v[j]
-            for i in range(d):
-                work.B[i, j] = work.zf[i].imag / STEP
-        for j in range(structure.unknown.shape[0] if work.P.shape[1] > d else 0):
-            at = structure.unknown[j]
-            work.zc[at] += 1j * STEP
-            structure.complex_known(work.zx, work.zv, work.zc, work.zf)
-            work.zc[at] = values.constants[at]
-            for i in range(d):
-                work.P[i, j] = work.zf[i].imag / STEP * values.slopes[j]
+            for j in range(d):
+                work.A[stage, i, j] = G[i, j]
+            if q == 0:
+                continue
+            out = work.P[stage, i]
+            for j in range(structure.unknown.shape[0]):
+                out[j] = G[i, d + m + j] * values.slopes[j]
+            by_delay = by_lag = 0.0
+            for j in range(m):
+                by_delay += G[i, d + j] * work.dv[j, 0]
+                by_lag += G[i, d + j] * work.dv[j, 1]
+            if structure.free_delay:
+                out[first] = by_delay * values.delay_slope
+            if structure.free_lag:
+                out[q - 1] = by_lag * values.lag_slope
+    else:
+        structure.known(work.xs, work.v, values.constants, work.f)
     if structure.width > 0:
-        _network(structure, values, work, sensitive)
+        _network(structure, values, work, stage, sensitive)
 
 
 @_inlined
-def _combine(work: Work, through_lag: Matrix, first: int, n_times: int) -> None:
-    """Write K = A S + P, with what the delay and the lag change of v added."""
-    d, n = work.S.shape
+def _copy(of: Matrix, into: Matrix) -> None:
+    for i in range(of.shape[0]):
+        for c in range(of.shape[1]):
+            into[i, c] = of[i, c]
+
+
+@_inlined
+def _advance(structure: Structure, work: Work, h: float) -> None:
+    """Move S by a step: S becomes F S + Σ W P over the stages."""
+    d, q = work.xs.shape[0], work.P.shape[2]
+    A, P, W, F = work.A, work.P, work.W, work.F
+    for stage in range(3, -1, -1):
+        weight = h / 3.0 if 0 < stage < 3 else h / 6.0
+        share = h if stage == 2 else 0.5 * h
+        for i in range(d):
+            for j in range(d):
+                total = 0.0
+                if stage < 3:
+                    for k in range(d):
+                        total += W[stage + 1, i, k] * A[stage + 1, k, j]
+                W[stage, i, j] = share * total + (weight if i == j else 0.0)
     for i in range(d):
-        K, P = work.K[i], work.P[i]
-        for c in range(n):
-            K[c] = P[c]
         for j in range(d):
-            a = work.A[i, j]
-            if a != 0.0:
-                S = work.Ss[j]
-                for c in range(n):
-                    K[c] += a * S[c]
-        for c in range(n_times):
-            for j in range(work.B.shape[1]):
-                K[first + c] += work.B[i, j] * through_lag[j, c]
+            F[i, j] = 1.0 if i == j else 0.0
+            for stage in range(4):
+                for k in range(d):
+                    F[i, j] += W[stage, i, k] * A[stage, k, j]
+    for i in range(d):
+        out, S, factor = work.moved[i], work.S[i], F[i, i]
+        for c in range(out.shape[0]):
+            out[c] = factor * S[c]
+        for j in range(d):
+            S, factor = work.S[j], F[i, j]
+            if j != i and factor != 0.0:
+                for c in range(out.shape[0]):
+                    out[c] += factor * S[c]
+        for k in structure.driven:
+            P0, P1, P2, P3 = P[0, k], P[1, k], P[2, k], P[3, k]
+            w0, w1, w2, w3 = W[0, i, k], W[1, i, k], W[2, i, k], W[3, i, k]
+            for c in range(q):
+                out[c] += w0 * P0[c] + w1 * P1[c] + w2 * P2[c] + w3 * P3[c]
+    _copy(work.moved, work.S)
 
 
 @_inlined
 def _held(
     values: Values, u: Vector, v: Vector, dv: Matrix, s: float, at: Vector, dat: Matrix
 ) -> None:
-    """Write v and its derivatives by delay and lag, (m, 2), s seconds later under u held."""
+    """Write v and its derivatives by delay and lag, (m, 2), s seconds later under u held.
+
+    They may be written in their own places.
+    """
     if values.lag <= 0.0:
         for j in range(u.shape[0]):
             at[j] = u[j]
@@ -266,9 +311,9 @@ def _held(
         return
     left = math.exp(-s / values.lag)
     for j in range(u.shape[0]):
-        at[j] = u[j] + (v[j] - u[j]) * left
         dat[j, 0] = left * dv[j, 0]
         dat[j, 1] = left * dv[j, 1] + (v[j] - u[j]) * left * s / (values.lag * values.lag)
+        at[j] = u[j] + (v[j] - u[j]) * left
 
 
 @_inlined
@@ -277,66 +322,28 @@ def _integrate(
     values: Values,
     work: Work,
     u: Vector,
-    v: Vector,
-    dv: Matrix,
     seconds: float,
     sensitive: bool,
 ) -> None:
-    """Move x and S, and v with its derivatives, by a time during which u is held."""
-    d, n = work.S.shape
-    m = u.shape[0]
+    """Move x and S, and what acts of u with its derivatives, by a time during which u is held."""
+    d = work.x.shape[0]
     steps = max(1, math.ceil(seconds / structure.longest_step - 1e-9))
     h = seconds / steps
-    q = n - d
-    n_times = int(structure.free_delay) + int(structure.free_lag) if q > 0 else 0
-    first = q - n_times
-    dat, picked = np.zeros((m, 2)), np.zeros((m, 2))
     for step in range(steps):
         for stage in range(4):
             share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
             weight = 1.0 / 3.0 if 0 < stage < 3 else 1.0 / 6.0
-            _held(values, u, v, dv, (step + share) * h, work.v, dat)
+            _held(values, u, work.now, work.dnow, (step + share) * h, work.v, work.dv)
             for i in range(d):
                 work.xs[i] = work.x[i] + share * h * (work.f[i] if stage else 0.0)
-            if sensitive:
-                for i in range(d):
-                    S, Ss, K = work.S[i], work.Ss[i], work.K[i]
-                    if stage == 0:
-                        for c in range(n):
-                            Ss[c] = S[c]
-                    else:
-                        for c in range(n):
-                            Ss[c] = S[c] + share * h * K[c]
-            _rates(structure, values, work, sensitive)
-            if sensitive:
-                for j in range(m):
-                    c = 0
-                    if structure.free_delay:
-                        picked[j, c] = dat[j, 0] * values.delay_slope
-                        c += 1
-                    if structure.free_lag:
-                        picked[j, c] = dat[j, 1] * values.lag_slope
-                _combine(work, picked, first, n_times)
+            _rates(structure, values, work, stage, sensitive)
             for i in range(d):
                 work.sum_f[i] = weight * work.f[i] + (work.sum_f[i] if stage else 0.0)
-                if sensitive:
-                    K, total = work.K[i], work.sums[i]
-                    if stage == 0:
-                        for c in range(n):
-                            total[c] = weight * K[c]
-                    else:
-                        for c in range(n):
-                            total[c] += weight * K[c]
         for i in range(d):
             work.x[i] += h * work.sum_f[i]
-            if sensitive:
-                S, total = work.S[i], work.sums[i]
-                for c in range(n):
-                    S[c] += h * total[c]
-    _held(values, u, v, dv, seconds, work.v, dat)
-    for j in range(m):
-        v[j] = work.v[j]
-        dv[j, 0], dv[j, 1] = dat[j, 0], dat[j, 1]
+        if sensitive:
+            _advance(structure, work, h)
+    _held(values, u, work.now, work.dnow, seconds, work.now, work.dnow)
 
 
 @_inlined
@@ -346,7 +353,6 @@ def _switched(
     work: Work,
     before: Vector,
     after: Vector,
-    dv: Matrix,
     sensitive: bool,
 ) -> None:
     """Take in that the input has switched: the derivatives by the delay change."""
@@ -354,7 +360,7 @@ def _switched(
         return
     if values.lag > 0.0:
         for j in range(before.shape[0]):
-            dv[j, 0] += (before[j] - after[j]) / values.lag
+            work.dnow[j, 0] += (before[j] - after[j]) / values.lag
         return
     d, n = work.S.shape
     if not sensitive or n == d:
@@ -364,12 +370,12 @@ def _switched(
         work.xs[i] = work.x[i]
     for j in range(before.shape[0]):
         work.v[j] = before[j]
-    _rates(structure, values, work, False)
+    _rates(structure, values, work, 0, False)
     for i in range(d):
         work.other[i] = work.f[i]
     for j in range(before.shape[0]):
         work.v[j] = after[j]
-    _rates(structure, values, work, False)
+    _rates(structure, values, work, 0, False)
     for i in range(d):
         work.S[i, column] += (work.other[i] - work.f[i]) * values.delay_slope
 
@@ -389,11 +395,11 @@ def acting_input(data: Data, row: int, delay: float, tolerance: float) -> int:
 
 
 @_compiled
-def filter_inputs(data: Data, values: Values, tolerance: float, v: Matrix, dv: types.Array) -> None:
+def filter_inputs(
+    data: Data, values: Values, tolerance: float, work: Work, v: Matrix, dv: types.Array
+) -> None:
     """Write v, (N, m), and its derivatives by delay and lag, (N, m, 2), at every row."""
-    m = data.inputs.shape[1]
-    at, dat, now, dnow = np.zeros(m), np.zeros((m, 2)), np.zeros(m), np.zeros((m, 2))
-    j = 0
+    m, now, dnow, j = data.inputs.shape[1], work.now, work.dnow, 0
     for row in range(data.time.shape[0]):
         if row == data.firsts[row]:
             j = acting_input(data, row, values.delay, tolerance)
@@ -408,10 +414,7 @@ def filter_inputs(data: Data, values: Values, tolerance: float, v: Matrix, dv: t
                     switch = np.inf
                 to = min(switch, end)
                 if to > t:
-                    _held(values, data.inputs[j], now, dnow, to - t, at, dat)
-                    for i in range(m):
-                        now[i] = at[i]
-                        dnow[i, 0], dnow[i, 1] = dat[i, 0], dat[i, 1]
+                    _held(values, data.inputs[j], now, dnow, to - t, now, dnow)
                     t = to
                 if switch == np.inf:
                     break
@@ -446,19 +449,17 @@ def run(
     """
     d, n = work.S.shape
     m = data.inputs.shape[1]
-    v, dv = np.zeros(m), np.zeros((m, 2))
     for i in range(m):
-        v[i] = filtered[first, i]
-        dv[i, 0], dv[i, 1] = dfiltered[first, i, 0], dfiltered[first, i, 1]
+        work.now[i] = filtered[first, i]
+        work.dnow[i, 0], work.dnow[i, 1] = dfiltered[first, i, 0], dfiltered[first, i, 1]
     for i in range(d):
         work.x[i] = start[i]
         states[0, i] = start[i]
     if sensitive:
         work.S[:] = 0.0
-        work.P[:] = 0.0
         for i in range(d):
             work.S[i, n - d + i] = 1.0
-        slopes[0] = work.S
+        _copy(work.S, slopes[0])
     j = acting_input(data, first, values.delay, tolerance)
     for row in range(first, last):
         t, end = data.time[row], data.time[row + 1]
@@ -468,18 +469,18 @@ def run(
                 switch = np.inf
             to = min(switch, end)
             if to > t:
-                _integrate(structure, values, work, data.inputs[j], v, dv, to - t, sensitive)
+                _integrate(structure, values, work, data.inputs[j], to - t, sensitive)
                 t = to
             if switch == np.inf:
                 break
-            _switched(structure, values, work, data.inputs[j], data.inputs[j + 1], dv, sensitive)
+            _switched(structure, values, work, data.inputs[j], data.inputs[j + 1], sensitive)
             j += 1
         for i in range(d):
             if not abs(work.x[i]) <= structure.limit:
                 return False
             states[row + 1 - first, i] = work.x[i]
         if sensitive:
-            slopes[row + 1 - first] = work.S
+            _copy(work.S, slopes[row + 1 - first])
     return True
 
 
@@ -573,6 +574,9 @@ def write_rows(
     dfiltered: types.Array,
     tolerance: float,
     work: Work,
+    states: Matrix,
+    slopes: types.Array,
+    Q: Matrix,
     R: Matrix,
     e: Vector,
     T: types.Array,
@@ -583,15 +587,12 @@ def write_rows(
     """Write the rows of windows, (k, 2) first and last rows, one below the other.
 
     ``squares`` are ‖e‖² of the windows with their initial states, (k, d), as they are; inf where a
-    window leaves the limit, whose rows are 0.
+    window leaves the limit, whose rows are 0. ``states``, ``slopes`` and Q, (rows n, d), are room
+    for the longest window.
     """
     d, n = work.S.shape
     q, channels = n - d, structure.measured.shape[0]
-    longest = 0
-    for k in range(windows.shape[0]):
-        longest = max(longest, windows[k, 1] - windows[k, 0] + 1)
-    states, slopes = np.empty((longest, d)), np.empty((longest, d, n))
-    Q, at = np.empty((longest * channels, d)), 0
+    at = 0
     for k in range(windows.shape[0]):
         first, rows = windows[k, 0], windows[k, 1] - windows[k, 0] + 1
         here = slice(at, at + rows * channels)
@@ -648,14 +649,12 @@ def write_squares(
     dfiltered: types.Array,
     tolerance: float,
     work: Work,
+    states: Matrix,
+    nothing: types.Array,
     squares: Vector,
 ) -> None:
     """Write ‖e‖² of windows, without sensitivities; inf where one leaves the limit."""
-    d, channels = work.x.shape[0], structure.measured.shape[0]
-    longest = 0
-    for k in range(windows.shape[0]):
-        longest = max(longest, windows[k, 1] - windows[k, 0] + 1)
-    states, nothing = np.empty((longest, d)), np.empty((0, d, 0))
+    channels = structure.measured.shape[0]
     for k in range(windows.shape[0]):
         first, last = windows[k, 0], windows[k, 1]
         inside = run(
