@@ -203,15 +203,22 @@ class Explorer(SavedExplored):
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, TIMEOUT_MAX)
         self._fallback = safe_input(spec, fallback)
-        scaled = in_scaled_numbers(spec)
-        self._journal = None if journal is None else Journal(journal, fsync, _about(scaled))
+        about = _about(in_scaled_numbers(spec))
+        self._journal = None if journal is None else Journal(journal, fsync, about)
         try:
-            unscaled = self._journal is not None and self._journal.is_unscaled
-            self._begin(spec if unscaled else scaled, deadline)
+            self._begin(self._as_begun(spec), deadline)
         except BaseException:
             if self._journal is not None:
                 self._journal.close()
             raise
+
+    def _as_begun(self, spec: TrialSpec) -> TrialSpec:
+        """Return the specification of a new exploration, or of one as the journal began it."""
+        journal = self._journal
+        if journal is not None and journal.lacks("env", "scaled"):
+            return spec
+        stays = journal is not None and journal.lacks("learner", "overshoot")
+        return in_scaled_numbers(spec, damped=not stays)
 
     def _begin(self, spec: TrialSpec, deadline: float | None) -> None:
         """Begin an exploration, or go on with the one in the journal."""
