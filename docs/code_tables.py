@@ -19,6 +19,7 @@ from analysis.cli import parser
 from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
+from dopt.explorer.signs import SIGNS
 from dopt.kernel import plugin
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System
@@ -179,7 +180,7 @@ def tables() -> str:
 
 
 def measures() -> str:
-    rows = [[f"`{name}`", said] for name, said in MEASURES.items()]
+    rows = [[f"`{name}`", said] for name, said in {**MEASURES, **SIGNS}.items()]
     return markdown(["measure", "value"], rows)
 
 

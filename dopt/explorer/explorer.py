@@ -131,6 +131,21 @@ class Explorer(SavedExplored):
         calls of :meth:`reset`
     ``missed``
         questions that were answered with the fallback, because the plan was not ready in time
+    ``unmoved``
+        stretches of 100 learned steps in which no parameter moved
+    ``late``
+        stretches of 200 learned steps whose errors follow from inputs of earlier steps: a delay
+        or a lag that was not declared; not tested where states are measured with noise
+    ``altered``
+        learned steps in which another input was applied than :meth:`ask` returned
+    ``out_of_scale``
+        learned accelerations of another size than a network learns, by the first 50 steps
+    ``beyond``
+        states beyond the limits
+    ``narrow``
+        sides of the box of which the first 500 states cover less than a tenth
+
+    Each of the last six is also said once, by a warning.
 
     Of a plant some of whose states are measured with noise (``Plant(measured=...)``), :meth:`ask`
     and :meth:`tell` are given these states, (n,), in the order of all, in their place; the learner
@@ -412,12 +427,12 @@ class Explorer(SavedExplored):
         if self._plans_each_step:
             if not self._planner.plan():
                 self._planner.wait()
-            self._note_plan()
+            self._note_plan(unasked=True)
 
-    def _note_plan(self) -> None:
+    def _note_plan(self, **more: bool) -> None:
         planned = self._state.planned
         if np.isfinite(planned).all():
-            self._note({"plan": planned.tolist()}, durable=False)
+            self._note({"plan": planned.tolist(), **more}, durable=False)
 
     def _wait(self) -> None:
         """Wait for a plan that was not ready in time, which the policy may remember."""

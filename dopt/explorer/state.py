@@ -32,6 +32,7 @@ import numpy as np
 from dopt.errors import ExplorationError
 from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
+from dopt.explorer.signs import Signs
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.scaled import scaled, scaled_trial
@@ -153,6 +154,8 @@ class ExplorerState:
         State x_t, or what was measured of it; None where it is unknown.
     answer : (m,) or None
         Input that was given for it.
+    was_asked : bool
+        Whether somebody asked for that input.
     time : float or None
         When it was measured [s].
     excess : (T,)
@@ -177,15 +180,18 @@ class ExplorerState:
         self.states = np.full((steps + 1, spec.system.n_states), np.nan)
         self.inputs, self.errors = np.zeros((steps, spec.system.n_inputs)), np.full(steps, np.nan)
         self._squares = np.zeros(spec.system.n_learned)
-        self._told_of_plans = False
+        self._told_of_plans, self.was_asked = False, True
+        self._signs = Signs(spec)
         self.excess = np.zeros(spec.system.horizon)
 
     def do(self, event: Event) -> None:
         """Change by one event."""
+        self._signs.note(event, self)
         if "learn" in event:
             self._learn(event)
         elif "plan" in event:
             self.answer = np.array(event["plan"]) if self.answer is None else self.answer
+            self.was_asked = not event.get("unasked")
         elif "missed" in event:
             self.counts["missed"] += 1
             self.answer = np.array(event["missed"])
@@ -294,6 +300,7 @@ class ExplorerState:
         self.counts["learned"] += 1
         self.present, self.time = x, event["time"]
         self.answer = None
+        self._signs.learned(self, dt)
         if not finite:
             raise ExplorationError(
                 f"the parameters are not finite after {self.done} steps: lower the learning rate, "
@@ -346,7 +353,8 @@ class ExplorerState:
                 sizes = np.sqrt(self._squares / SIZED_STEPS)
                 where = f"over the first {SIZED_STEPS} steps"
                 units = self._scaled.accelerations if self._scaled.is_scaled else None
-                warn_of_sizes(system, sizes, where, _UNITS, units)
+                found = warn_of_sizes(system, sizes, where, _UNITS, units)
+                self.counts["out_of_scale"] += found
 
     def _compare(self, planned: Array) -> None:
         """Say so once if a plan that is replayed is another one than when it was made."""

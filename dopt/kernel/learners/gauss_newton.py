@@ -1,8 +1,8 @@
 """Fits of a network to many samples in compiled code: in a trial, and to given samples.
 
 In a trial (:mod:`dopt.learning.least_squares`) the numbers are λ, ρ, the steps from one fit to the
-next, the Gauss-Newton steps of a fit, and whether one that overshoots is damped. To given samples (:mod:`dopt.offline_fit`) a network is
-fitted by the method of Levenberg and Marquardt:
+next, the Gauss-Newton steps of a fit, and whether one that overshoots is damped. To given samples
+(:mod:`dopt.offline_fit`) a network is fitted by the method of Levenberg and Marquardt:
 
 ======  =====================================================================  =========
 symbol  meaning                                                                shape
