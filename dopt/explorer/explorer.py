@@ -134,8 +134,8 @@ class Explorer(SavedExplored):
     ``unmoved``
         stretches of 100 learned steps in which no parameter moved
     ``late``
-        stretches of 200 learned steps whose errors follow from inputs of earlier steps: a delay
-        or a lag that was not declared; not tested where states are measured with noise
+        stretches of 300 steps whose errors follow from inputs of earlier steps: a delay or a lag
+        that was not declared; not tested where states are measured with noise
     ``altered``
         learned steps in which another input was applied than :meth:`ask` returned
     ``out_of_scale``

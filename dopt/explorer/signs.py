@@ -1,10 +1,10 @@
 """Signs that an exploration fails: counted by its events alone, and each said once.
 
-Errors are those of accelerations, with their signs, by parameters that are at most 50 steps old. Of
-each learned row, each input and each lag k the share ρ² is taken of the errors that u_{t-k}
-explains beyond a constant, the features of x_t and u_t, on which alone a plant depends that
-answers at once. Estimated states depend on earlier inputs by their filter: of these there is no
-such test.
+Errors are those of accelerations, with their signs, by parameters that are at most 50 steps old.
+For each learned row and each input the share of their squares is taken that the input of the eight
+steps before explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a
+plant depends that answers at once. Estimated states depend on earlier inputs by their filter: of
+these there is no such test.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
-    "late": "stretches of 200 learned steps whose errors follow from earlier inputs",
+    "late": "stretches of 300 steps whose errors follow from earlier inputs",
     "altered": "learned steps in which another input was applied than was asked",
     "out_of_scale": "learned accelerations of another size than a network learns",
     "beyond": "states beyond the limits",
@@ -37,17 +37,17 @@ SIGNS = {
 BLOCK = 50
 """Steps after which parameters are compared; one set of parameters predicts so many."""
 
-TESTED = 200
-"""Steps of a test for earlier inputs."""
-
-FEWEST = 100
-"""Fewest of them that follow ``LAGS`` others without a gap."""
+FIRST, TESTED = 200, 300
+"""Steps before the first test for earlier inputs, while much is left to learn, and fewest of one."""
 
 LAGS = 8
-"""Longest lag that is tested, in steps."""
+"""Longest lag that is tested, in steps; tested steps follow so many others without a gap."""
 
-EXPLAINED, OF_MOTION = 0.25, 0.1
-"""Share ρ² of the errors, and its root mean square by the accelerations', which are said."""
+EXPLAINED, OF_MOTION = 0.14, 0.25
+"""Share of the squares of the errors, and its size beside the accelerations', that are said.
+
+Noise has the share in one test in 600,000.
+"""
 
 FOLLOWS = 1e-6
 """Share of the squares of an input, beyond what is given, that counts as none."""
@@ -68,8 +68,8 @@ _TEXTS = {
     "correct the model (%s): raise the regularization or the noise variance of the learner, or "
     "take another one such as 'adam_window'",
     "late": "the errors of the predictions follow from inputs of earlier steps, most from that of "
-    "%d samples before (%.0f %% of their squares), but the plant is expected to answer at once, or "
-    "as declared: declare Plant(delay=..., lag=...)",
+    "%d samples before (all of them explain %.0f %% of their squares), but the plant is expected to "
+    "answer at once, or as declared: declare Plant(delay=..., lag=...)",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
     "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
     "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
@@ -93,9 +93,8 @@ class Signs:
         self._parameters: Array | None = None  # at the beginning of the block
         self._still = 0  # blocks in a row that left them as they were
         self._start = 0  # first of the steps that followed each other
-        self._starts: list[int] = []  # that of each step since the last test
-        self._seconds: list[float] = []  # time of each of them
-        self._errors: list[Array] = []  # (BLOCK, r) of each block of them
+        self._steps: list[tuple[int, float]] = []  # that of each step of the block, and its time
+        self._tested: list[tuple[Array, ...]] = []  # rows of the next test, of each block
         self._told: set[str] = set()
 
     def note(self, event: Event, state: ExplorerState) -> None:
@@ -122,8 +121,7 @@ class Signs:
             state.counts["beyond"] += 1
             if limits.enforced:
                 self._say("beyond", state.excess[done - 1], done)
-        self._starts.append(self._start)
-        self._seconds.append(seconds)
+        self._steps.append((self._start, seconds))
         if done % BLOCK == 0:
             self._end_block(state)
         if done == AFTER:
@@ -136,47 +134,48 @@ class Signs:
         if self._still and self._still % (100 // BLOCK) == 0:
             state.counts["unmoved"] += 1
             self._say("unmoved", self._spec.learner.name)
-        if before is not None and not self._spec.system.n_measured:
-            self._errors.append(self._block_errors(state, before))
-        if state.done % TESTED == 0:
-            if len(self._errors) * BLOCK == TESTED:
-                self._test_lags(state)
-            self._starts, self._seconds, self._errors = [], [], []
+        if before is not None and state.done > FIRST and not self._spec.system.n_measured:
+            self._tested.append(self._rows(state, before))
+            if sum(len(errors) for errors, *_ in self._tested) >= TESTED:
+                self._test(state, *map(np.concatenate, zip(*self._tested, strict=True)))
+                self._tested = []
+        self._steps = []
 
-    def _block_errors(self, state: ExplorerState, parameters: Array) -> Array:
-        """Return the errors of accelerations, (BLOCK, r), of the steps of a block."""
+    def _rows(self, state: ExplorerState, parameters: Array) -> tuple[Array, ...]:
+        """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).
+
+        They are of the steps of the block that follow others without a gap.
+        """
         system, done, model = self._system, state.done, self._spec.model
-        x, u = state.steps.states[done - BLOCK : done + 1], state.steps.inputs[done - BLOCK : done]
-        seconds = np.array(self._seconds[-BLOCK:])[:, None]
+        t, (starts, seconds) = np.arange(done - BLOCK, done), np.array(self._steps).T
+        t = t[(t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)]
+        x, u = state.steps.states[t], state.steps.inputs[t]
+        moved = (state.steps.states[t + 1] - x) / seconds[t - done, None]
         with np.errstate(all="ignore"):
             following = predict(
-                system, lambda x, u: model.predict(system, parameters, x, u), x[:-1], u[:, None]
+                system, lambda x, u: model.predict(system, parameters, x, u), x, u[:, None]
             )[0]
-            errors = (x[1:] - x[:-1]) / seconds - (following - x[:-1]) / system.dt
-        rows: Array = errors[:, list(system.learned_rows)]
-        return rows
+            foreseen = (following - x) / system.dt
+        rows = list(system.learned_rows)
+        given = np.hstack([np.ones((len(t), 1)), _features(system, x), u])
+        earlier = np.stack([state.steps.inputs[t - k] for k in range(1, LAGS + 1)], axis=-1)
+        return (moved - foreseen)[:, rows], moved[:, rows], given, earlier
 
-    def _test_lags(self, state: ExplorerState) -> None:
-        first, starts = state.done - TESTED, np.array(self._starts)
-        t = first + np.arange(TESTED)
-        whole = (t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)
-        if np.count_nonzero(whole) < FEWEST:
+    def _test(
+        self, state: ExplorerState, errors: Array, moved: Array, given: Array, earlier: Array
+    ) -> None:
+        """Count where inputs of earlier steps explain errors."""
+        if not (np.isfinite(errors).all() and np.isfinite(given).all()):
             return
-        t, errors = t[whole], np.concatenate(self._errors)[whole]
-        seconds = np.array(self._seconds)[whole]
-        x, inputs = state.steps.states, state.steps.inputs
-        moved = ((x[t + 1] - x[t]) / seconds[:, None])[:, list(self._system.learned_rows)]
-        if not (np.isfinite(errors).all() and np.isfinite(moved).all()):
-            return
-        given = np.hstack([np.ones((len(t), 1)), _features(self._system, x[t]), inputs[t]])
-        earlier = np.stack([inputs[t - k] for k in range(1, LAGS + 1)])
-        shares, sizes = explained(errors, given, earlier)
-        sizes /= np.maximum(moved.std(axis=0), np.finfo(float).tiny)
-        shares[sizes < OF_MOTION] = 0.0
-        lag = int(np.argmax(shares.max(axis=(1, 2))))
-        if shares[lag].max() >= EXPLAINED:
+        largest, lag = 0.0, 0
+        for j in range(earlier.shape[1]):
+            shares, sizes, most = explained(errors, given, earlier[:, j])
+            share = float(np.max(shares, where=sizes >= OF_MOTION * moved.std(axis=0), initial=0.0))
+            if share > largest:
+                largest, lag = share, most
+        if largest >= EXPLAINED:
             state.counts["late"] += 1
-            self._say("late", lag + 1, 100.0 * shares[lag].max())
+            self._say("late", lag, 100.0 * largest)
 
     def _measure_box(self, state: ExplorerState) -> None:
         """Count the sides of the box of which the states so far cover little."""
@@ -193,29 +192,34 @@ class Signs:
             _log.warning(_TEXTS[sign], *numbers)
 
 
-def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array]:
-    """Return what each of several inputs explains of errors beyond what is given.
+def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array, int]:
+    """Return what an input of earlier steps explains of errors beyond what is given.
 
     Parameters
     ----------
-    errors, given : (N, r), (N, p)
-    earlier : (L, N, m)
+    errors, given, earlier : (N, r), (N, p), (N, L)
 
     Returns
     -------
-    shares : (L, m, r)
-        Squared partial correlations, 0 of inputs that follow from what is given.
-    sizes : (L, m, r)
-        Root mean squares of the explained part, in the unit of the errors.
+    shares : (r,)
+        Shares of the squares of the errors that all lags explain together.
+    sizes : (r,)
+        Root mean squares of that part, in the unit of the errors.
+    lag : int
+        Lag, from 1 on, that alone explains most of what they do.
     """
     basis = np.linalg.qr(given)[0]
     rest = errors - basis @ (basis.T @ errors)
     free = earlier - basis @ (basis.T @ earlier)
-    squares = np.sum(free**2, axis=1)
-    squares[squares <= FOLLOWS * np.sum(earlier**2, axis=1)] = np.inf
-    found = np.einsum("lnm,nr->lmr", free, rest) ** 2 / squares[..., None]
+    squares = np.sum(free**2, axis=0)
+    known = squares <= FOLLOWS * np.sum(earlier**2, axis=0)  # it follows from what is given
+    free[:, known], squares[known] = 0.0, np.inf
+    alone = np.sum((free.T @ rest) ** 2, axis=1) / squares
+    basis, sizes = np.linalg.svd(free, full_matrices=False)[:2]
+    basis = basis[:, sizes**2 > FOLLOWS * np.sum(sizes**2)]
+    found = np.sum((basis.T @ rest) ** 2, axis=0)
     total = np.maximum(np.sum(rest**2, axis=0), np.finfo(float).tiny)
-    return found / total, np.sqrt(found / len(errors))
+    return found / total, np.sqrt(found / len(errors)), 1 + int(np.argmax(alone))
 
 
 def _features(system: System, states: Array) -> Array:

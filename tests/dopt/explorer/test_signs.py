@@ -21,7 +21,7 @@ from dopt.types import Array
 from orchestrate.store import Reader
 from tests.dopt.explorer.plants import MOTOR, content, explorer, following, without_checksums
 
-STEPS = 600
+STEPS = 800
 
 
 def drive(one: Explorer, steps: int, delay: int = 0, seed: int = 0) -> None:
@@ -55,7 +55,7 @@ def test_an_undeclared_delay_is_said_with_its_samples(
 ) -> None:
     with explorer(steps=STEPS) as one:
         drive(one, STEPS, delay)
-        assert one.counts["late"] == 2  # from 200 steps on, at each 200
+        assert one.counts["late"] == 2  # at steps 500 and 800
     [text] = [text for text in said(caplog) if "earlier steps" in text]
     assert f"{delay} samples before" in text
 
@@ -169,24 +169,25 @@ def test_signs_are_stored_and_shown(tmp_path: Path) -> None:
         drive(one, 100)
         one.save(url, test=(one.states, one.inputs))
         assert [row[1] for row in content(url)["assessed"]] == ["free_run_error"]
-        drive(one, 350, 2)
+        drive(one, 450, 2)
         one.save(url)
-        assert content(url)["assessed"][1:] == [(450, "late", float(one.counts["late"]))]
+        assert content(url)["assessed"][1:] == [(550, "late", float(one.counts["late"]))]
     with Reader.open(url) as reader:
         key = reader.rows("SELECT trial_key FROM v_trial")[0].trial_key
     page = TestClient(create_app(url)).get(f"/trials/{key}").text
     assert f"<dt>{SIGNS['late']}</dt><dd>1</dd>" in page
 
 
-def test_the_share_that_an_input_explains_is_its_partial_correlation() -> None:
+def test_what_earlier_inputs_explain_is_a_share_of_what_is_left_of_the_errors() -> None:
     rng = np.random.default_rng(0)
-    given, inputs = rng.standard_normal((500, 3)), rng.standard_normal((2, 500, 2))
-    inputs[1, :, 1] = given[:, 0]  # follows from what is given
-    errors = given @ rng.standard_normal((3, 2)) + 0.1 * rng.standard_normal((500, 2))
-    errors[:, 1] += 3.0 * inputs[0, :, 1]
-    shares, sizes = explained(errors, given, inputs)
-    assert shares[0, 1, 1] == pytest.approx(9.0 / 9.01, rel=1e-2)
-    assert sizes[0, 1, 1] == pytest.approx(3.0, rel=0.1)
-    assert shares[1, 1].tolist() == [0.0, 0.0]
-    shares[0, 1, 1] = 0.0
-    assert shares.max() < 0.1 * EXPLAINED
+    given, earlier = rng.standard_normal((500, 3)), rng.standard_normal((500, 4))
+    earlier[:, 0] = given[:, 0]  # follows from what is given
+    errors = given @ rng.standard_normal((3, 2)) + rng.standard_normal((500, 2))
+    errors[:, 1] += 3.0 * earlier[:, 2]
+    shares, sizes, lag = explained(errors, given, earlier)
+    assert lag == 3
+    assert shares[1] == pytest.approx(0.9, abs=0.02)
+    assert sizes[1] == pytest.approx(3.0, rel=0.1)
+    assert shares[0] < 0.1 * EXPLAINED
+    shares, sizes, _ = explained(errors, given, np.repeat(given[:, :1], 4, axis=1))
+    assert shares.tolist() == sizes.tolist() == [0.0, 0.0]
