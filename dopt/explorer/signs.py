@@ -38,7 +38,7 @@ BLOCK = 50
 """Steps after which parameters are compared; one set of parameters predicts so many."""
 
 FIRST, TESTED = 200, 300
-"""Steps before the first test for earlier inputs, while much is left to learn, and fewest of one."""
+"""Steps before tests for earlier inputs, while much is left to learn, and fewest of a test."""
 
 LAGS = 8
 """Longest lag that is tested, in steps; tested steps follow so many others without a gap."""
@@ -46,7 +46,7 @@ LAGS = 8
 EXPLAINED, OF_MOTION = 0.14, 0.25
 """Share of the squares of the errors, and its size beside the accelerations', that are said.
 
-Noise has the share in one test in 600,000.
+Noise has the share in one test of an input in 500,000.
 """
 
 FOLLOWS = 1e-6
@@ -68,8 +68,8 @@ _TEXTS = {
     "correct the model (%s): raise the regularization or the noise variance of the learner, or "
     "take another one such as 'adam_window'",
     "late": "the errors of the predictions follow from inputs of earlier steps, most from that of "
-    "%d samples before (all of them explain %.0f %% of their squares), but the plant is expected to "
-    "answer at once, or as declared: declare Plant(delay=..., lag=...)",
+    "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
+    "once, or as declared: declare Plant(delay=..., lag=...)",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
     "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
     "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
