@@ -37,8 +37,9 @@ SIGNS = {
 BLOCK = 50
 """Steps after which parameters are compared; one set of parameters predicts so many."""
 
-FIRST, TESTED = 200, 300
-"""Steps before tests for earlier inputs, while much is left to learn, and fewest of a test."""
+FIRST, TESTED, EVERY = 200, 300, 3000
+"""Steps before tests for earlier inputs, while much is left to learn; fewest of a test; and steps
+from two tests, which take 2 ms each, to the next two."""
 
 LAGS = 8
 """Longest lag that is tested, in steps; tested steps follow so many others without a gap."""
@@ -93,30 +94,20 @@ class Signs:
         self._parameters: Array | None = None  # at the beginning of the block
         self._still = 0  # blocks in a row that left them as they were
         self._start = 0  # first of the steps that followed each other
-        self._steps: list[tuple[int, float]] = []  # that of each step of the block, and its time
-        self._tested: list[tuple[Array, ...]] = []  # rows of the next test, of each block
+        self._steps: list[tuple[int, float]] = []  # that of each step, and its time
+        self._models: list[Array] = []  # parameters at the beginning of each block of them
+        self._rows: list[tuple[Array, ...]] = []  # of the next test
         self._told: set[str] = set()
 
-    def note(self, event: Event, state: ExplorerState) -> None:
-        """Count what an event says of the state that it is about to change."""
-        if "learn" in event:
-            asked = state.answer
-            if state.was_asked and asked is not None and event["applied"] != asked.tolist():
-                self._compare(np.array(event["applied"]) - asked, state)
-        elif not event.keys().isdisjoint(("begin", "gap", "lost")):
-            self._start = state.done
+    def restart(self, t: int) -> None:
+        """Begin at step t from a state that need not follow the one before."""
+        self._start = t
 
-    def _compare(self, change: Array, state: ExplorerState) -> None:
-        """Count an input that was not applied as it was asked."""
-        if np.abs(change).max() <= ROUNDING * self._spec.system.gamma:
-            return
-        state.counts["altered"] += 1
-        if (n := state.counts["altered"]) >= max(MANY, COMMON * state.done):
-            self._say("altered", n, state.done + 1)
-
-    def learned(self, state: ExplorerState, seconds: float) -> None:
+    def learned(self, state: ExplorerState, event: Event, seconds: float) -> None:
         """Count after a step of so many seconds was learned from."""
-        done, limits = state.done, self._spec.limits
+        done, limits, asked = state.done, self._spec.limits, state.answer
+        if state.was_asked and asked is not None and event["applied"] != asked.tolist():
+            self._compare(np.array(event["applied"]) - asked, state)
         if limits is not None and state.excess[done - 1] > 0.0:
             state.counts["beyond"] += 1
             if limits.enforced:
@@ -127,6 +118,14 @@ class Signs:
         if done == AFTER:
             self._measure_box(state)
 
+    def _compare(self, change: Array, state: ExplorerState) -> None:
+        """Count an input that was not applied as it was asked."""
+        if np.abs(change).max() <= ROUNDING * self._spec.system.gamma:
+            return
+        state.counts["altered"] += 1
+        if (n := state.counts["altered"]) >= max(MANY, COMMON * state.done):
+            self._say("altered", n, state.done)
+
     def _end_block(self, state: ExplorerState) -> None:
         before, self._parameters = self._parameters, np.array(state.steps.parameters)
         same = before is not None and np.array_equal(before, self._parameters)
@@ -134,32 +133,47 @@ class Signs:
         if self._still and self._still % (100 // BLOCK) == 0:
             state.counts["unmoved"] += 1
             self._say("unmoved", self._spec.learner.name)
-        if before is not None and state.done > FIRST and not self._spec.system.n_measured:
-            self._tested.append(self._rows(state, before))
-            if sum(len(errors) for errors, *_ in self._tested) >= TESTED:
-                self._test(state, *map(np.concatenate, zip(*self._tested, strict=True)))
-                self._tested = []
-        self._steps = []
+        tested = 0 < (state.done - FIRST) % EVERY <= 2 * TESTED
+        if not tested or self._spec.system.n_measured or before is None:
+            self._steps = []
+            return
+        self._models.append(before)
+        if len(self._steps) == TESTED:
+            self._rows.append(self._new_rows(state))
+            self._steps, self._models = [], []
+            if sum(len(errors) for errors, *_ in self._rows) >= TESTED:
+                self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
+                self._rows = []
 
-    def _rows(self, state: ExplorerState, parameters: Array) -> tuple[Array, ...]:
+    def _new_rows(self, state: ExplorerState) -> tuple[Array, ...]:
         """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).
 
-        They are of the steps of the block that follow others without a gap.
+        They are of the last steps, where these follow others without a gap.
         """
-        system, done, model = self._system, state.done, self._spec.model
-        t, (starts, seconds) = np.arange(done - BLOCK, done), np.array(self._steps).T
-        t = t[(t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)]
-        x, u = state.steps.states[t], state.steps.inputs[t]
-        moved = (state.steps.states[t + 1] - x) / seconds[t - done, None]
+        system, first, predicted = self._system, state.done - TESTED, self._spec.model.predict
+        x, u = state.steps.states[first : state.done + 1], state.steps.inputs[first : state.done]
+
+        def accelerations(x: Array, u: Array) -> Array:
+            blocks = zip(
+                self._models,
+                x.reshape(-1, BLOCK, x.shape[1]),
+                u.reshape(-1, BLOCK, u.shape[1]),
+                strict=True,
+            )
+            return np.concatenate([predicted(system, *block) for block in blocks])
+
+        starts, seconds = np.array(self._steps).T
         with np.errstate(all="ignore"):
-            following = predict(
-                system, lambda x, u: model.predict(system, parameters, x, u), x, u[:, None]
-            )[0]
-            foreseen = (following - x) / system.dt
-        rows = list(system.learned_rows)
-        given = np.hstack([np.ones((len(t), 1)), _features(system, x), u])
+            moved = (x[1:] - x[:-1]) / seconds[:, None]
+            errors = (
+                moved - (predict(system, accelerations, x[:-1], u[:, None])[0] - x[:-1]) / system.dt
+            )
+        t = np.arange(first, state.done)
+        t = t[(t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)]
+        at, rows = t - first, list(system.learned_rows)
+        given = np.hstack([np.ones((len(t), 1)), _features(system, x[at]), u[at]])
         earlier = np.stack([state.steps.inputs[t - k] for k in range(1, LAGS + 1)], axis=-1)
-        return (moved - foreseen)[:, rows], moved[:, rows], given, earlier
+        return errors[at][:, rows], moved[at][:, rows], given, earlier
 
     def _test(
         self, state: ExplorerState, errors: Array, moved: Array, given: Array, earlier: Array

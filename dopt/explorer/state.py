@@ -186,7 +186,6 @@ class ExplorerState:
 
     def do(self, event: Event) -> None:
         """Change by one event."""
-        self._signs.note(event, self)
         if "learn" in event:
             self._learn(event)
         elif "plan" in event:
@@ -265,6 +264,7 @@ class ExplorerState:
     def _move(self, x: Array, time: float | None) -> None:
         same = self.present is not None and np.array_equal(x, self.present)
         self.present, self.time, self.answer = x, time, None
+        self._signs.restart(self.done)
         if not (same and self.spec.system.n_measured):  # then the estimate stays
             state = np.zeros(self.spec.system.n_states)
             state[self._measured] = x
@@ -299,8 +299,8 @@ class ExplorerState:
         self.done += 1
         self.counts["learned"] += 1
         self.present, self.time = x, event["time"]
+        self._signs.learned(self, event, dt)
         self.answer = None
-        self._signs.learned(self, dt)
         if not finite:
             raise ExplorationError(
                 f"the parameters are not finite after {self.done} steps: lower the learning rate, "

@@ -104,7 +104,8 @@ def test_other_inputs_than_asked_are_counted_and_said_once(
 
 
 def test_inputs_that_nobody_asked_for_are_not_altered(tmp_path: Path) -> None:
-    options: Mapping[str, Any] = {"policy": {"name": "icem", "plans": 4, "elites": 2}, "journal": tmp_path / "run.jsonl"}
+    policy = {"name": "icem", "plans": 4, "elites": 2}  # which remembers its plans
+    options: Mapping[str, Any] = {"policy": policy, "journal": tmp_path / "run.jsonl"}
     for _ in range(2):
         with explorer(**options) as one:
             x = one.states[-1] if one.n_steps else np.array([0.1, 0.0])
