@@ -19,6 +19,7 @@ from analysis.cli import parser
 from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
+from dopt.explorer.signs import SIGNS
 from dopt.fitting.stored import FIT_MEASURES
 from dopt.kernel import plugin
 from dopt.systems import NAMED_SYSTEMS
@@ -179,7 +180,8 @@ def tables() -> str:
     )
 
 
-def measures(of: Mapping[str, str] = MEASURES) -> str:
+def measures(of: Mapping[str, str] | None = None) -> str:
+    of = {**MEASURES, **SIGNS} if of is None else of
     rows = [[f"`{name}`", said] for name, said in of.items()]
     return markdown(["measure", "value"], rows)
 

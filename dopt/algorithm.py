@@ -69,6 +69,9 @@ INVARIANT = 1e-9
 SMALLEST_SHARE = 1.0 / 64.0
 """Smallest share of a Gauss-Newton step that is tried."""
 
+DAMPINGS = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
+"""Dampings that are tried, in units of the largest entry of the diagonal, where all shares fail."""
+
 NO_GROWTH = 1.0 + 1e-10
 """Growth of a sum of squares that counts as none: at its minimum rounding must not decide."""
 

@@ -89,11 +89,10 @@ class Journal:
             self._file.close()
             raise
 
-    @property
-    def is_unscaled(self) -> bool:
-        """Whether it holds an exploration of a plant in its own units, as all once were."""
-        section = self.events[0]["trial"].get("env") if self.events else {"scaled": True}
-        return not (isinstance(section, Mapping) and section.get("scaled"))
+    def lacks(self, section: str, field: str) -> bool:
+        """Return True if it holds an exploration that was begun before there was such a field."""
+        stored = self.events[0]["trial"].get(section) if self.events else {field: True}
+        return not (isinstance(stored, Mapping) and stored.get(field))
 
     def write(self, event: Event, *, durable: bool) -> None:
         """Append an event; one that is not durable may wait for the next one that is.

@@ -17,6 +17,7 @@ from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.arguments import reals, whole
 from dopt.explorer.flight import InFlight
+from dopt.explorer.signs import SIGNS
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
@@ -190,6 +191,7 @@ KINDS = (
     "resets",
     "missed",
     "refits",
+    *SIGNS,
 )
 """Kinds of events in :attr:`Explored.counts`."""
 
@@ -389,6 +391,7 @@ class SavedExplored(Explored):
         with self._lock:
             states, inputs, errors = self.states, self.inputs, self.errors
             parameters, excess = self.parameters.copy(), self._state.excess[: self.n_steps].copy()
+            counts = self.counts
         at = _diverged_at(errors, parameters)
         n = len(errors) if at is None else at
         errors[n:] = np.nan
@@ -398,6 +401,7 @@ class SavedExplored(Explored):
             tested += (self._tested(test, n, parameters),)
         if self.spec.limits is not None:
             tested += violations(excess[:n])
+        tested += tuple(Assessment(n, sign, float(counts[sign])) for sign in SIGNS if counts[sign])
         return TrialResult(
             loss=errors,
             reachable_loss=unknown,

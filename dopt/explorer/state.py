@@ -36,6 +36,7 @@ from dopt.errors import ExplorationError
 from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
 from dopt.explorer.refit import Found, Recording
+from dopt.explorer.signs import Signs
 from dopt.learning import SimulationError
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
@@ -164,6 +165,8 @@ class ExplorerState:
         State x_t, or what was measured of it; None where it is unknown.
     answer : (m,) or None
         Input that was given for it.
+    was_asked : bool
+        Whether somebody asked for that input.
     time : float or None
         When it was measured [s].
     excess : (T,)
@@ -189,7 +192,8 @@ class ExplorerState:
         self.states = np.full((steps + 1, spec.system.n_states), np.nan)
         self.inputs, self.errors = np.zeros((steps, spec.system.n_inputs)), np.full(steps, np.nan)
         self._squares = np.zeros(spec.system.n_learned)
-        self._told_of_plans = False
+        self._told_of_plans, self.was_asked = False, True
+        self._signs = Signs(spec)
         self.excess = np.zeros(spec.system.horizon)
 
     def do(self, event: Event) -> None:
@@ -199,6 +203,7 @@ class ExplorerState:
             self._learn(event)
         elif "plan" in event:
             self.answer = np.array(event["plan"]) if self.answer is None else self.answer
+            self.was_asked = not event.get("unasked")
         elif "missed" in event:
             self.counts["missed"] += 1
             self.answer = np.array(event["missed"])
@@ -292,6 +297,7 @@ class ExplorerState:
     def _move(self, x: Array, time: float | None) -> None:
         same = self.present is not None and np.array_equal(x, self.present)
         self.present, self.time, self.answer = x, time, None
+        self._signs.restart(self.done)
         if not (same and self.spec.system.n_measured):  # then the estimate stays
             state = np.zeros(self.spec.system.n_states)
             state[self._measured] = x
@@ -326,6 +332,7 @@ class ExplorerState:
         self.done += 1
         self.counts["learned"] += 1
         self.present, self.time = x, event["time"]
+        self._signs.learned(self, event, dt)
         self.answer = None
         if not finite:
             raise ExplorationError(
@@ -379,7 +386,8 @@ class ExplorerState:
                 sizes = np.sqrt(self._squares / SIZED_STEPS)
                 where = f"over the first {SIZED_STEPS} steps"
                 units = self._scaled.accelerations if self._scaled.is_scaled else None
-                warn_of_sizes(system, sizes, where, _UNITS, units)
+                found = warn_of_sizes(system, sizes, where, _UNITS, units)
+                self.counts["out_of_scale"] += found
 
     def _compare(self, planned: Array) -> None:
         """Say so once if a plan that is replayed is another one than when it was made."""

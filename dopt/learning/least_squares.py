@@ -84,7 +84,9 @@ class GaussNewton(InformationLearner):
     """Fit all samples: minimise ‖e‖²/ρ + λ‖θ - θ₀‖² from the present θ on.
 
     A fit takes damped Gauss-Newton steps θ += s M⁻¹ (Jᵀe/ρ + λ(θ₀ - θ)): s is 1, or the first of
-    1/2, 1/4, ... 1/64 at which the objective does not grow; where it grows at all of them, θ stays.
+    1/2, 1/4, ... 1/64 at which the objective does not grow. Where it grows at all of them, because
+    the model is far from linear over a long step along parameters that little is known of, θ stays,
+    or M + μI takes the place of M, with the first of five μ at which the objective falls.
     M then belongs to the last step: the rows of all samples in the buffer at the parameters before
     it. (With other learners M sums rows at the parameters of their own time.) Between two fits the
     newest sample is filtered (:class:`dopt.learning.ExtendedKalman`). A λ so small that rounding
@@ -98,6 +100,9 @@ class GaussNewton(InformationLearner):
         Steps from one fit to the next.
     steps : int
         Gauss-Newton steps of a fit.
+    overshoot : str
+        Where the objective grows at all shares, θ may "stay", step after step, or the step is to
+        "damp". New explorations of a plant damp it.
     """
 
     name: ClassVar[str] = "gauss_newton"
@@ -108,12 +113,14 @@ class GaussNewton(InformationLearner):
     capacity: int = parameter(10_000, "samples", "positive")
     refit_every: int = parameter(1, "steps", "positive")
     steps: int = parameter(1, "steps", "positive")
+    overshoot: str = parameter("stay", choices=("stay", "damp"), added=True)
 
     def samples_kept(self, horizon: int) -> int:
         return min(self.capacity, horizon)
 
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
-        return regularization, self.noise_variance, float(self.refit_every), float(self.steps)
+        fit = float(self.refit_every), float(self.steps), float(self.overshoot == "damp")
+        return regularization, self.noise_variance, *fit
 
 
 class Renewal(NamedTuple):

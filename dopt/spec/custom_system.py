@@ -63,14 +63,18 @@ def warn_of_prior(policy: Policy, model: Model, learner: Learner) -> None:
 
 def warn_of_sizes(
     system: System, sizes: Array, where: str, first: str = "", units: Array | None = None
-) -> None:
+) -> int:
     """Warn of each learned acceleration whose size, (r,), a network does not learn well.
+
+    Returns how many there are.
 
     ``first`` is advice that goes before that on its unit. With ``units``, (r,), sizes are multiples
     of these, which the box of a plant decides about.
     """
+    found = 0
     for k, (row, size) in enumerate(zip(system.learned_rows, sizes, strict=True)):
         if size > LARGEST or 0 < size < SMALLEST:
+            found += 1
             unit = 1.0 if units is None else units[k]
             remedy = "measure that state in a unit"
             if units is not None:
@@ -83,6 +87,7 @@ def warn_of_sizes(
                 ScaleWarning,
                 stacklevel=2,
             )
+    return found
 
 
 FACTORS = (0.5, 1.0, 2.0)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dopt.control.planning import Accelerations
-from dopt.learning import LEARNERS
+from dopt.learning import LEARNERS, GaussNewton
 from dopt.limits import Limits, names_of
 from dopt.models import MODELS
 from dopt.policies import POLICIES, Policy, TaskOptimal
@@ -97,18 +97,21 @@ def scaled(system: System) -> Scaled:
     return Scaled(system, np.ones(system.n_states), 1.0, is_scaled=False)
 
 
-def in_scaled_numbers(spec: TrialSpec) -> TrialSpec:
+def in_scaled_numbers(spec: TrialSpec, *, damped: bool = True) -> TrialSpec:
     """Return the specification of a new exploration.
 
     That of a plant works with scaled numbers, unless a policy, model or learner is of a user's own
-    class, which is given the numbers of the plant that it was written for.
+    class, which is given the numbers of the plant that it was written for. ``damped`` says whether
+    fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
     """
     parts = ((spec.policy, POLICIES), (spec.model, MODELS), (spec.learner, LEARNERS))
     shipped = all(type(part) in [*registry.values()] for part, registry in parts)
     if not (shipped and isinstance(spec.system, ExploredPlant)):
         return spec
-    system = spec.system.plant.system(spec.system.horizon, scaled=True)
-    return TrialSpec(dataclasses.replace(spec.config, system=system), spec.seed)
+    system, learner = spec.system.plant.system(spec.system.horizon, scaled=True), spec.learner
+    if damped and isinstance(learner, GaussNewton):
+        learner = dataclasses.replace(learner, overshoot="damp")
+    return TrialSpec(dataclasses.replace(spec.config, system=system, learner=learner), spec.seed)
 
 
 def scaled_trial(spec: TrialSpec) -> TrialSpec:

@@ -481,10 +481,11 @@ def _write_steps(
 
 
 def _replace_arrays(connection: Connection, rows: PreparedRows) -> None:
-    """Replace the trajectory, and the assessments where there are new ones."""
+    """Replace the trajectory, and the measures of which there are new assessments."""
     trial_id = rows.claim.trial_id
     connection.execute(delete(trajectory).where(trajectory.c.trial_id == trial_id))
     connection.execute(insert(trajectory), rows.trajectory)
     if rows.assessments:
-        connection.execute(delete(assessment).where(assessment.c.trial_id == trial_id))
+        new = assessment.c.measure.in_({row["measure"] for row in rows.assessments})
+        connection.execute(delete(assessment).where(assessment.c.trial_id == trial_id, new))
         connection.execute(insert(assessment), rows.assessments)

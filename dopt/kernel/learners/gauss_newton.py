@@ -1,8 +1,8 @@
 """Fits of a network to many samples in compiled code: in a trial, and to given samples.
 
 In a trial (:mod:`dopt.learning.least_squares`) the numbers are λ, ρ, the steps from one fit to the
-next and the Gauss-Newton steps of a fit. To given samples (:mod:`dopt.offline_fit`) a network is
-fitted by the method of Levenberg and Marquardt:
+next, the Gauss-Newton steps of a fit, and whether one that overshoots is damped. To given samples
+(:mod:`dopt.offline_fit`) a network is fitted by the method of Levenberg and Marquardt:
 
 ======  =====================================================================  =========
 symbol  meaning                                                                shape
@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE, ModelKind
+from dopt.algorithm import DAMPINGS, NO_GROWTH, SMALLEST_SHARE, ModelKind
 from dopt.kernel import model_kinds
 from dopt.kernel.compiler import called_from_python, compiled, squared
 from dopt.kernel.learners.adam import sampled_point, store_sample
@@ -53,10 +53,12 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     n, q = min(t + 1, seen.shape[1]), state.theta.shape[0]
     features, targets = seen[:, :n].copy(), observed[:, :n].copy()
     ridge, factor = numbers[0] * noise_variance, np.empty((q, q))
-    definite = True
+    definite, damped = True, numbers[4] > 0.0
     for _ in range(steps):
         definite = definite and take_step(
-            trial.plant, trial.network, state.theta, state.prior, ridge, features, targets, factor
+            *(trial.plant, trial.network, state.theta, state.prior, ridge, features, targets),
+            factor,
+            damped,
         )
     if not (definite and _write_information(state, factor, noise_variance)):
         state.theta[:] = np.nan  # which ends the trial as diverged
@@ -87,40 +89,75 @@ def take_step(
     ridge: float,
     features: Matrix,
     targets: Matrix,
-    normal: Matrix,
+    factor: Matrix,
+    damped: bool,
 ) -> bool:
-    """Take a damped step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖².
+    """Take a shortened Gauss-Newton step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖².
 
     ``features`` (p, N), ``targets`` (r, N), θ and θ₀ (q,). The Cholesky factor of JᵀJ + ridge I
     before the step is written, (q, q). False, and no step, where rounding has left it indefinite.
+    Where the sum grows at all shares of the step, θ stays, or a damped step is taken.
     """
     q = theta.shape[0]
-    step = np.empty(q)
-    if network.kind == ModelKind.MLP:
-        squares = normal_equations(network, theta, features, targets, normal, step)
-    else:
-        model_kinds.write_normal_equations(plant, network, theta, features, targets, normal, step)
-        squares = model_kinds.squared_error(plant, network, theta, features, targets)
+    slope, before = np.empty(q), theta.copy()
+    squares = _write_normal(plant, network, theta, features, targets, factor, slope)
     squares += ridge * squared_distance(theta, prior)
     for i in range(q):
-        normal[i, i] += ridge
-        step[i] += ridge * (prior[i] - theta[i])
-    if not factorize(normal):
+        factor[i, i] += ridge
+        slope[i] += ridge * (prior[i] - theta[i])
+    normal = factor.copy() if damped else factor
+    if not factorize(factor):
         return False
-    solve(normal, step)
-    share, before = 1.0, theta.copy()
+    step = slope.copy()
+    solve(factor, step)
+    share = 1.0
     while share >= SMALLEST_SHARE:
         for i in range(q):
             theta[i] = before[i] + share * step[i]
-        if network.kind == ModelKind.MLP:
-            after = errors_of(network, theta, features, targets)[0]
-        else:
-            after = model_kinds.squared_error(plant, network, theta, features, targets)
+        after = _squared_error(plant, network, theta, features, targets)
         if after + ridge * squared_distance(theta, prior) <= squares * NO_GROWTH:
             return True
         share *= 0.5
+    largest, short = np.diag(normal).max(), np.empty((q, q))
+    for k in range(len(DAMPINGS) if damped else 0):
+        short[:], step[:] = normal, slope
+        for i in range(q):
+            short[i, i] += DAMPINGS[k] * largest
+        if factorize(short):
+            solve(short, step)
+            theta[:] = before + step
+            after = _squared_error(plant, network, theta, features, targets)
+            if after + ridge * squared_distance(theta, prior) < squares:
+                return True
     theta[:] = before
     return True
+
+
+@compiled
+def _write_normal(
+    plant: Plant,
+    network: Network,
+    theta: Vector,
+    features: Matrix,
+    targets: Matrix,
+    normal: Matrix,
+    slope: Vector,
+) -> float:
+    """Write JᵀJ, (q, q), and Jᵀe, (q,), of a model of any kind; return ‖e‖²."""
+    if network.kind == ModelKind.MLP:
+        return normal_equations(network, theta, features, targets, normal, slope)
+    model_kinds.write_normal_equations(plant, network, theta, features, targets, normal, slope)
+    return model_kinds.squared_error(plant, network, theta, features, targets)
+
+
+@compiled
+def _squared_error(
+    plant: Plant, network: Network, theta: Vector, features: Matrix, targets: Matrix
+) -> float:
+    """Return ‖e‖² of a model of any kind."""
+    if network.kind == ModelKind.MLP:
+        return errors_of(network, theta, features, targets)[0]
+    return model_kinds.squared_error(plant, network, theta, features, targets)
 
 
 @compiled

@@ -1,0 +1,270 @@
+"""Signs that an exploration fails: counted by its events alone, and each said once.
+
+Errors are those of accelerations, with their signs, by parameters that are at most 50 steps old.
+For each learned row and each input the share of their squares is taken that the input of the eight
+steps before explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a
+plant depends that answers at once. Estimated states depend on earlier inputs by their filter: of
+these there is no such test.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from typing import Protocol
+
+import numpy as np
+
+from dopt.control.planning import predict
+from dopt.explorer.journal import Event
+from dopt.learning import SimulationError
+from dopt.spec.scaled import scaled
+from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.types import Array
+
+SIGNS = {
+    "unmoved": "stretches of 100 learned steps in which no parameter moved",
+    "late": "stretches of 300 steps whose errors follow from earlier inputs",
+    "altered": "learned steps in which another input was applied than was asked",
+    "out_of_scale": "learned accelerations of another size than a network learns",
+    "beyond": "states beyond the limits",
+    "narrow": "sides of the box of which the first 500 states cover less than a tenth",
+}
+"""What is counted of each sign."""
+
+BLOCK = 50
+"""Steps after which parameters are compared; one set of parameters predicts so many."""
+
+FIRST, TESTED, EVERY = 200, 300, 3000
+"""Steps before tests for earlier inputs, while much is left to learn; fewest of a test; and steps
+from two tests, which take 2 ms each, to the next two."""
+
+LAGS = 8
+"""Longest lag that is tested, in steps; tested steps follow so many others without a gap."""
+
+EXPLAINED, OF_MOTION = 0.14, 0.25
+"""Share of the squares of the errors, and its size beside the accelerations', that are said.
+
+Noise has the share in one test of an input in 500,000.
+"""
+
+FOLLOWS = 1e-6
+"""Share of the squares of an input, beyond what is given, that counts as none."""
+
+MANY, COMMON = 20, 0.1
+"""Altered inputs, and their share of all, that are said."""
+
+ROUNDING = 1e-9
+"""Difference of two inputs, in units of γ, that counts as none."""
+
+COVERED, AFTER = 0.1, 500
+"""Share of a side of the box that so many states are expected to cover."""
+
+_log = logging.getLogger("dopt.explorer")
+
+_TEXTS = {
+    "unmoved": "no parameter moved in the last 100 learned steps, but each step is expected to "
+    "correct the model (%s): raise the regularization or the noise variance of the learner, or "
+    "take another one such as 'adam_window'",
+    "late": "the errors of the predictions follow from inputs of earlier steps, most from that of "
+    "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
+    "once, or as declared: declare Plant(delay=..., lag=...)",
+    "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
+    "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
+    "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
+    "none is: raise their margin or steps, and check the known part",
+    "narrow": "the first 500 states cover %.2g %% of the box along %s, but the model is to hold in "
+    "all of it: declare a smaller box, raise gamma, or choose another policy",
+}
+
+
+class Steps(Protocol):
+    """What is read of the steps of an exploration, in scaled numbers."""
+
+    @property
+    def states(self) -> Array: ...
+    @property
+    def inputs(self) -> Array: ...
+    @property
+    def parameters(self) -> Array: ...
+
+
+class Exploration(Protocol):
+    """What is read of a state of an exploration, except for the counts, which are changed."""
+
+    done: int
+    counts: Counter[str]
+    states: Array
+    excess: Array
+    answer: Array | None
+    was_asked: bool
+    system: System
+
+    @property
+    def steps(self) -> Steps: ...
+
+
+class Signs:
+    """Counts of the signs, in the counts of an exploration.
+
+    Parameters
+    ----------
+    spec : TrialSpec
+        Plant, model and limits.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        self._spec = spec
+        self._parameters: Array | None = None  # at the beginning of the block
+        self._still = 0  # blocks in a row that left them as they were
+        self._start = 0  # first of the steps that followed each other
+        self._steps: list[tuple[int, float]] = []  # that of each step, and its time
+        self._models: list[Array] = []  # parameters at the beginning of each block of them
+        self._rows: list[tuple[Array, ...]] = []  # of the next test
+        self._told: set[str] = set()
+
+    def restart(self, t: int) -> None:
+        """Begin at step t from a state that need not follow the one before."""
+        self._start = t
+
+    def learned(self, state: Exploration, event: Event, seconds: float) -> None:
+        """Count after a step of so many seconds was learned from."""
+        done, limits, asked = state.done, self._spec.limits, state.answer
+        if state.was_asked and asked is not None and event["applied"] != asked.tolist():
+            self._compare(np.array(event["applied"]) - asked, state)
+        if limits is not None and state.excess[done - 1] > 0.0:
+            state.counts["beyond"] += 1
+            if limits.enforced:
+                self._say("beyond", state.excess[done - 1], done)
+        self._steps.append((self._start, seconds))
+        if done % BLOCK == 0:
+            self._end_block(state)
+        if done == AFTER:
+            self._measure_box(state)
+
+    def _compare(self, change: Array, state: Exploration) -> None:
+        """Count an input that was not applied as it was asked."""
+        if np.abs(change).max() <= ROUNDING * self._spec.system.gamma:
+            return
+        state.counts["altered"] += 1
+        if (n := state.counts["altered"]) >= max(MANY, COMMON * state.done):
+            self._say("altered", n, state.done)
+
+    def _end_block(self, state: Exploration) -> None:
+        before, self._parameters = self._parameters, np.array(state.steps.parameters)
+        refitted = isinstance(self._spec.learner, SimulationError)  # which moves them now and then
+        same = before is not None and np.array_equal(before, self._parameters) and not refitted
+        self._still = self._still + 1 if same else 0
+        if self._still and self._still % (100 // BLOCK) == 0:
+            state.counts["unmoved"] += 1
+            self._say("unmoved", self._spec.learner.name)
+        tested = 0 < (state.done - FIRST) % EVERY <= 2 * TESTED
+        if not tested or self._spec.system.n_measured or before is None:
+            self._steps = []
+            return
+        self._models.append(before)
+        if len(self._steps) == TESTED:
+            self._rows.append(self._new_rows(state))
+            self._steps, self._models = [], []
+            if sum(len(errors) for errors, *_ in self._rows) >= TESTED:
+                self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
+                self._rows = []
+
+    def _new_rows(self, state: Exploration) -> tuple[Array, ...]:
+        """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).
+
+        They are of the last steps, where these follow others without a gap.
+        """
+        system, first = scaled(state.system).system, state.done - TESTED
+        predicted = self._spec.model.predict
+        x, u = state.steps.states[first : state.done + 1], state.steps.inputs[first : state.done]
+
+        def accelerations(x: Array, u: Array) -> Array:
+            blocks = zip(
+                self._models,
+                x.reshape(-1, BLOCK, x.shape[1]),
+                u.reshape(-1, BLOCK, u.shape[1]),
+                strict=True,
+            )
+            return np.concatenate([predicted(system, *block) for block in blocks])
+
+        starts, seconds = np.array(self._steps).T
+        with np.errstate(all="ignore"):
+            moved = (x[1:] - x[:-1]) / seconds[:, None]
+            errors = (
+                moved - (predict(system, accelerations, x[:-1], u[:, None])[0] - x[:-1]) / system.dt
+            )
+        t = np.arange(first, state.done)
+        t = t[(t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)]
+        at, rows = t - first, list(system.learned_rows)
+        given = np.hstack([np.ones((len(t), 1)), _features(system, x[at]), u[at]])
+        earlier = np.stack([state.steps.inputs[t - k] for k in range(1, LAGS + 1)], axis=-1)
+        return errors[at][:, rows], moved[at][:, rows], given, earlier
+
+    def _test(
+        self, state: Exploration, errors: Array, moved: Array, given: Array, earlier: Array
+    ) -> None:
+        """Count where inputs of earlier steps explain errors."""
+        if not (np.isfinite(errors).all() and np.isfinite(given).all()):
+            return
+        largest, lag = 0.0, 0
+        for j in range(earlier.shape[1]):
+            shares, sizes, most = explained(errors, given, earlier[:, j])
+            share = float(np.max(shares, where=sizes >= OF_MOTION * moved.std(axis=0), initial=0.0))
+            if share > largest:
+                largest, lag = share, most
+        if largest >= EXPLAINED:
+            state.counts["late"] += 1
+            self._say("late", lag, 100.0 * largest)
+
+    def _measure_box(self, state: Exploration) -> None:
+        """Count the sides of the box of which the states so far cover little."""
+        system, x = self._spec.system, state.states[: state.done + 1]
+        for axis, (low, high) in system.grid_box().items():
+            covered = float(np.ptp(x[:, axis])) / (high - low)
+            if covered < COVERED:
+                state.counts["narrow"] += 1
+                self._say("narrow", 100.0 * covered, system.state_labels[axis])
+
+    def _say(self, sign: str, *numbers: object) -> None:
+        if sign not in self._told:
+            self._told.add(sign)
+            _log.warning(_TEXTS[sign], *numbers)
+
+
+def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array, int]:
+    """Return what an input of earlier steps explains of errors beyond what is given.
+
+    Parameters
+    ----------
+    errors, given, earlier : (N, r), (N, p), (N, L)
+
+    Returns
+    -------
+    shares : (r,)
+        Shares of the squares of the errors that all lags explain together.
+    sizes : (r,)
+        Root mean squares of that part, in the unit of the errors.
+    lag : int
+        Lag, from 1 on, that alone explains most of what they do.
+    """
+    basis = np.linalg.qr(given)[0]
+    rest = errors - basis @ (basis.T @ errors)
+    free = earlier - basis @ (basis.T @ earlier)
+    squares = np.sum(free**2, axis=0)
+    known = squares <= FOLLOWS * np.sum(earlier**2, axis=0)  # it follows from what is given
+    free[:, known], squares[known] = 0.0, np.inf
+    alone = np.sum((free.T @ rest) ** 2, axis=1) / squares
+    basis, sizes = np.linalg.svd(free, full_matrices=False)[:2]
+    basis = basis[:, sizes**2 > FOLLOWS * np.sum(sizes**2)]
+    found = np.sum((basis.T @ rest) ** 2, axis=0)
+    total = np.maximum(np.sum(rest**2, axis=0), np.finfo(float).tiny)
+    return found / total, np.sqrt(found / len(errors)), 1 + int(np.argmax(alone))
+
+
+def _features(system: System, states: Array) -> Array:
+    """Return states, (N, d), with the cosine and the sine in the place of each angle."""
+    angles = list(system.angle_indices)
+    turned = states[:, angles]
+    return np.hstack([np.delete(states, angles, axis=1), np.cos(turned), np.sin(turned)])

@@ -1,0 +1,194 @@
+"""Signs that an exploration fails: what is counted, said once, replayed, stored and shown."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+import dopt.explorer.explorer as module
+from analysis.serve.app import create_app
+from dopt import Explorer
+from dopt.explorer.signs import EXPLAINED, SIGNS, explained
+from dopt.spec.scaled import in_scaled_numbers
+from dopt.types import Array
+from orchestrate.store import Reader
+from tests.dopt.explorer.plants import MOTOR, content, explorer, following, without_checksums
+
+STEPS = 800
+
+
+def drive(one: Explorer, steps: int, delay: int = 0, noise: float = 1e-3) -> None:
+    """Let the motor follow the answers, so many steps late, with noise."""
+    rng, x = np.random.default_rng(0), np.array([0.1, 0.0])
+    late = [np.zeros(1)] * delay
+    for _ in range(steps):
+        late.append(one.ask(x))
+        x = following(x, late.pop(0)) + noise * rng.normal(0.0, [0.1, 1.0])
+        one.tell(x)
+
+
+def signs(one: Explorer) -> dict[str, int]:
+    return {sign: one.counts[sign] for sign in SIGNS if one.counts[sign]}
+
+
+def said(log: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in log.records if record.name == "dopt.explorer"]
+
+
+def test_a_motor_as_declared_shows_no_sign(caplog: pytest.LogCaptureFixture) -> None:
+    with explorer(policy="d_optimal", steps=STEPS) as one:
+        drive(one, STEPS)
+        assert signs(one) == {}
+    assert said(caplog) == []
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_an_undeclared_delay_is_said_with_its_samples(
+    caplog: pytest.LogCaptureFixture, delay: int
+) -> None:
+    with explorer(steps=STEPS) as one:
+        drive(one, STEPS, delay)
+        assert one.counts["late"] == 2  # at steps 500 and 800
+    [text] = [text for text in said(caplog) if "earlier steps" in text]
+    assert f"{delay} samples before" in text
+
+
+def test_a_declared_delay_is_no_sign() -> None:
+    plant = dataclasses.replace(MOTOR, delay=2 * MOTOR.dt)
+    with Explorer(plant, policy="random", steps=STEPS) as one:
+        drive(one, STEPS, 2)
+        assert one.counts["late"] == 0
+
+
+def test_gaps_are_no_part_of_the_test_for_a_delay() -> None:
+    with explorer(steps=STEPS) as one:
+        x, late = np.array([0.1, 0.0]), [np.zeros(1)] * 2
+        for step in range(STEPS):
+            if step % 40 == 0:  # moved by hand, while the inputs in flight are forgotten
+                one.reset()
+                x, late = np.array([0.01 * (step % 7), 1.0]), [np.zeros(1)] * 2
+            late.append(one.ask(x))
+            x = following(x, late.pop(0))
+            one.tell(x)
+        assert one.counts["late"] > 0
+
+
+def test_other_inputs_than_asked_are_counted_and_said_once(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    def go(one: Explorer, steps: int) -> None:
+        for step in range(steps):
+            u = one.ask(x := one.states[-1] if one.n_steps else np.array([0.1, 0.0]))
+            rounded = u * (1.0 + 1e-15)
+            applied = 0.5 * u if step % 2 else rounded
+            one.tell(following(x, applied), applied=applied)
+
+    with explorer(journal=tmp_path / "run.jsonl") as one:
+        go(one, 60)
+        counts = one.counts
+        assert signs(one) == {"altered": 30}
+    assert sum("another input" in text for text in said(caplog)) == 1
+    caplog.clear()
+    with explorer(journal=tmp_path / "run.jsonl") as again:
+        assert again.counts == counts
+        assert sum("another input" in text for text in said(caplog)) == 1
+        go(again, 60)
+    assert sum("another input" in text for text in said(caplog)) == 1
+
+
+def test_inputs_that_nobody_asked_for_are_not_altered(tmp_path: Path) -> None:
+    policy = {"name": "icem", "plans": 4, "elites": 2}  # which remembers its plans
+    options: Mapping[str, Any] = {"policy": policy, "journal": tmp_path / "run.jsonl"}
+    for _ in range(2):
+        with explorer(**options) as one:
+            x = one.states[-1] if one.n_steps else np.array([0.1, 0.0])
+            one.ask(x)
+            one.tell(following(x, np.ones(1)), applied=[1.0])
+            for _ in range(30):
+                x = one.states[-1]
+                one.tell(following(x, np.ones(1)), applied=[1.0])
+            assert one.counts["altered"] <= 2
+
+
+def test_states_in_a_small_part_of_the_box_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    with explorer(steps=STEPS) as one:
+        x = np.array([0.1, 0.0])
+        for step in range(STEPS):
+            one.ask(x)
+            one.tell(x := np.array([0.02 * np.sin(step / 9.0), 0.0]), applied=[0.0])
+        assert one.counts["narrow"] == 2
+    assert sum("% of the box along angle [rad]" in text for text in said(caplog)) == 1
+
+
+def test_states_beyond_the_limits_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    limits = {"bounds": {"rate": [-0.5, 0.5]}, "enforced": False}
+    with explorer(limits=limits, policy="random") as one:
+        drive(one, 100)
+        beyond = np.count_nonzero(np.abs(one.states[1:, 1]) > 0.5)
+        assert one.counts["beyond"] == beyond > 0
+    assert not any("beyond the limits" in text for text in said(caplog))
+
+
+def test_a_fit_damps_a_step_that_overshoots(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """An exploration whose fits stay goes on as it was made; a new one damps them."""
+
+    def go(one: Explorer) -> Array:
+        drive(one, 300, 2, noise=0.0)
+        return one.parameters
+
+    options = {"policy": "d_optimal", "learner": "gauss_newton", "seed": 0}
+    with explorer(**options) as one:
+        damped = go(one)
+        assert one.counts["unmoved"] == 0
+    journal = tmp_path / "old.jsonl"
+    with monkeypatch.context() as patch:
+        stays = partial(in_scaled_numbers, damped=False)
+        patch.setattr(module, "in_scaled_numbers", lambda spec, **_: stays(spec))
+        with explorer(journal=journal, **options) as one:
+            before, counts = go(one), one.counts
+            assert counts["unmoved"] > 0
+    assert sum("no parameter moved" in text for text in said(caplog)) == 1
+    journal.write_text(without_checksums(journal).replace(', "overshoot": "stay"', "", 1))
+    with explorer(journal=journal, **options) as one:
+        assert np.array_equal(one.parameters, before)
+        assert not np.array_equal(one.parameters, damped)
+        assert one.counts == counts
+
+
+def test_signs_are_stored_and_shown(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    with explorer(steps=STEPS) as one:
+        drive(one, 100)
+        one.save(url, test=(one.states, one.inputs))
+        assert [row[1] for row in content(url)["assessed"]] == ["free_run_error"]
+        drive(one, 450, 2)
+        one.save(url)
+        assert content(url)["assessed"][1:] == [(550, "late", float(one.counts["late"]))]
+    with Reader.open(url) as reader:
+        key = reader.rows("SELECT trial_key FROM v_trial")[0].trial_key
+    page = TestClient(create_app(url), base_url="http://127.0.0.1").get(f"/trials/{key}").text
+    assert f"<dt>{SIGNS['late']}</dt><dd>1</dd>" in page
+
+
+def test_what_earlier_inputs_explain_is_a_share_of_what_is_left_of_the_errors() -> None:
+    rng = np.random.default_rng(0)
+    given, earlier = rng.standard_normal((500, 3)), rng.standard_normal((500, 4))
+    earlier[:, 0] = given[:, 0]  # follows from what is given
+    errors = given @ rng.standard_normal((3, 2)) + rng.standard_normal((500, 2))
+    errors[:, 1] += 3.0 * earlier[:, 2]
+    shares, sizes, lag = explained(errors, given, earlier)
+    assert lag == 3
+    assert shares[1] == pytest.approx(0.9, abs=0.02)
+    assert sizes[1] == pytest.approx(3.0, rel=0.1)
+    assert shares[0] < 0.1 * EXPLAINED
+    shares, sizes, _ = explained(errors, given, np.repeat(given[:, :1], 4, axis=1))
+    assert shares.tolist() == sizes.tolist() == [0.0, 0.0]
