@@ -167,7 +167,9 @@ def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
     chosen = fit(plant, log, width=width, seed=seed, weights=WEIGHTS, workers=1).chosen
     values, s = chosen.model.values(chosen.solution.p), chosen.model.structure
     layout = s.feature_centers, s.feature_scales, values.sizes
-    weights = values.weights if chosen.model.width else np.empty(0)
+    weights = np.empty(0)
+    if chosen.model.width:
+        weights = np.concatenate([part.ravel() for part in chosen.model.matrices(values.weights)])
     return Found(values.constants, values.delay, values.lag, weights, *layout)
 
 

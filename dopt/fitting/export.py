@@ -134,7 +134,7 @@ def environment(found: Any) -> Any:
                 self.state, self._acting = advance(
                     model, p, values.lag, self.state, self._acting, self._asked[row], seconds
                 )
-            inside = bool(np.all(np.abs(self.state) <= model.structure.limit))
+            inside = bool(np.all(np.abs(self.state) <= model.structure.limits))
             return self.state.copy(), 0.0, not inside, False, {}
 
     return FittedPlant()

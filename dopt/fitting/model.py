@@ -125,6 +125,8 @@ class Model:
         layout = layout or Layout(np.zeros(p), np.ones(p), np.ones(r))
         measured = [i for i, name in enumerate(plant.states) if name in measured_names(plant)]
         self.rates = rates_of(plant, measured)
+        limits = plant.system(1, scaled=True).state_limits
+        limits[list(system.angle_indices)] = np.finfo(float).max  # they turn without bound
         self.structure = Structure(
             known=known.values,
             derivatives=known.derivatives,
@@ -140,7 +142,7 @@ class Model:
             free_delay=free_delay,
             free_lag=free_lag,
             longest_step=longest_step or plant.dt,
-            limit=system.state_limit,
+            limits=limits,
         )
         self.sizes = layout.sizes
         self._guesses = np.array([*plant.guesses.values()], float)

@@ -92,7 +92,7 @@ class Structure(NamedTuple):
     free_delay: bool
     free_lag: bool
     longest_step: float  # [s]
-    limit: float  # largest magnitude of a state
+    limits: Vector  # (d,) largest magnitude of each state
 
 
 class Values(NamedTuple):
@@ -476,7 +476,7 @@ def run(
             _switched(structure, values, work, data.inputs[j], data.inputs[j + 1], sensitive)
             j += 1
         for i in range(d):
-            if not abs(work.x[i]) <= structure.limit:
+            if not abs(work.x[i]) <= structure.limits[i]:
                 return False
             states[row + 1 - first, i] = work.x[i]
         if sensitive:

@@ -133,6 +133,14 @@ CASES: dict[str, tuple[bool, dict[str, Any]]] = {
         False,
         {"policy": "gaussian_process", "model": "gaussian_process", "learner": "conditioning"},
     ),
+    "simulation_error": (
+        False,
+        {
+            "policy": "random",
+            "model": {"name": "mlp", "depth": 1, "width": 8},
+            "learner": {"name": "simulation_error", "growth": 1.0},
+        },
+    ),
 }  # fmt: skip
 
 cases = pytest.mark.parametrize("case", CASES)
@@ -199,6 +207,18 @@ def in_its_own(case: str, run: Callable[[], Run], steps: int) -> Learned:
 def test_powers_of_two_change_no_bit(case: str, units: Units, run: Callable[[], Run]) -> None:
     expected = in_its_own(case, run, 100)
     for found, known in zip(learned(case, run(), units, 100), expected, strict=True):
+        np.testing.assert_array_equal(found, known)
+
+
+@pytest.mark.parametrize("units", [Units(8.0, 0.25), Units(1024.0)], ids=str)
+def test_powers_of_two_change_no_bit_of_a_refit(units: Units) -> None:
+    expected = in_its_own("simulation_error", simulated, 310)
+    assert not np.array_equal(
+        expected.parameters, in_its_own("simulation_error", simulated, 100)[0]
+    )
+    for found, known in zip(
+        learned("simulation_error", simulated(), units, 310), expected, strict=True
+    ):
         np.testing.assert_array_equal(found, known)
 
 
