@@ -181,7 +181,8 @@ class Explorer(SavedExplored):
     fsync : bool
         Whether events are on the disk, and not only in the file, before a call returns.
     deadline : float, optional
-        Seconds that :meth:`ask` waits for a plan. Then it returns the fallback.
+        Seconds that :meth:`ask` waits for a plan. Then it returns the fallback. With one,
+        :meth:`tell` does not wait for fits of the learner 'simulation_error'.
     fallback : (m,), optional
         A safe input, 0 unless it is given.
     tolerance : float

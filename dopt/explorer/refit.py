@@ -22,7 +22,6 @@ import numpy as np
 
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import Event
-from dopt.learning import Learner, SimulationError
 from dopt.log import Log, Piece
 from dopt.spec.scaled import Scaled
 from dopt.systems.plant import Plant, unknown
@@ -46,16 +45,13 @@ class Recording:
         Rows of the last fit that came into force, 0 without one.
     """
 
-    def __init__(self, learner: Learner) -> None:
-        self._kept = isinstance(learner, SimulationError)
+    def __init__(self) -> None:
         self._pieces: list[tuple[list[float], list[Any], list[Any]]] = []
         self._ended = True
         self.rows = self.fitted = 0
 
     def note(self, event: Event, state: ExplorerState) -> None:
         """Take in an event before the state changes by it."""
-        if not self._kept:
-            return
         if "learn" in event:
             assert state.present is not None
             if self._ended:
@@ -79,13 +75,7 @@ class Recording:
             self.fitted = event["rows"]
 
     def log(self, plant: Plant) -> Log:
-        """Return the log, (rows + 1) of each piece; the input of a last row is the one before it.
-
-        Raises
-        ------
-        SpecificationError
-            If nothing was learned yet.
-        """
+        """Return the log; the input of the last row of a piece is the one before it."""
         if not self._pieces:
             raise SpecificationError(
                 "nothing was learned yet, but a log has two rows or more: ask() and tell() first."

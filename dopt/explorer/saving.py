@@ -20,6 +20,7 @@ from dopt.explorer.flight import InFlight
 from dopt.explorer.signs import SIGNS
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
+from dopt.log import Log
 from dopt.result import Assessment, TrialResult
 from dopt.spec.scaled import learned_accelerations, scaled
 from dopt.spec.trial import PrequentialTrial, TrialSpec
@@ -236,6 +237,22 @@ class Explored:
         guesses = *plant.guesses.values(), first_guess(plant.delay), first_guess(plant.lag)
         names = *plant.constants, "delay", "lag"
         return dict(zip(names, system.fitted or guesses, strict=True))
+
+    def log(self) -> Log:
+        """Return what was measured and applied so far, for :func:`dopt.fit`.
+
+        Raises
+        ------
+        SpecificationError
+            If nothing was learned yet, or a system is explored that is no :class:`dopt.Plant`.
+        """
+        system = self._state.system
+        if not isinstance(system, ExploredPlant):
+            raise SpecificationError(
+                f"env '{system.name}' is explored, but a dopt.Plant is expected for a log: its "
+                f"states and inputs have names."
+            )
+        return self._state.run.log(system.plant)
 
     @property
     def states(self) -> Array:

@@ -152,7 +152,7 @@ class ExplorerState:
     system : System
         The plant, with the constants, delay and lag that the last refit has found.
     run : Recording
-        What was measured and applied, for a learner that fits it.
+        What was measured and applied, for fits.
     steps : Steps
         The arrays and the steps of the trial, in scaled numbers.
     states, inputs : (T + 1, d), (T, m)
@@ -179,7 +179,7 @@ class ExplorerState:
 
     def __init__(self, spec: TrialSpec) -> None:
         self.spec, self.system, self._scaled = spec, spec.system, scaled(spec.system)
-        self.run = Recording(spec.learner)
+        self.run = Recording()
         self.steps = _steps_of(scaled_trial(spec))
         self.done, self.counts = 0, Counter[str]()
         self.present: Array | None = None

@@ -206,8 +206,8 @@ class Plant:
         States in radians of which a(x) is a function of period 2π. They may be measured over one
         turn or over many: each is followed from one state to the next.
     constants : mapping of str to float or Unknown
-        Numbers that the expressions name. :func:`dopt.fit` estimates what is
-        :func:`dopt.unknown`; an exploration takes its first guess.
+        Numbers that the expressions name. :func:`dopt.fit` and the learner 'simulation_error'
+        estimate what is :func:`dopt.unknown`; explorations by other learners take its first guess.
     measured : mapping of str to float or Encoder
         Standard deviation of the noise of each state that is measured, or :func:`dopt.encoder`;
         without any, all states are measured, and their noise is left to the learner.

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt import Explorer, Plant, TrialSpec, encoder, unknown
+from dopt import SYSTEMS, Explorer, Plant, TrialSpec, encoder, unknown
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.explorer.flight import InFlight
 from dopt.explorer.refit import FitBeside, Found
@@ -175,7 +175,7 @@ def test_a_gap_a_reset_and_a_jump_begin_new_pieces() -> None:
         drive(one, rig, 10)
         one.ask(rig.x, rig.time + 0.1 * DT)  # the same state, asked later
         one.tell(rig.x, time=rig.time + DT)
-        log = one._state.run.log(PLANT)
+        log = one.log()
         assert [len(piece.time) for piece in log.pieces] == [11, 11, 11, 12]
         assert log.n_rows == one.n_steps + 4
         steps = np.diff(log.pieces[-1].time) / DT
@@ -254,4 +254,9 @@ def test_an_explorer_of_a_plant_has_its_guesses_as_constants() -> None:
         assert isinstance(one.spec.system, ExploredPlant)
         assert one.spec.system.integrator == "rk4"
         with pytest.raises(SpecificationError, match="nothing was learned yet"):
-            one._state.run.log(PLANT)
+            one.log()
+    with (
+        Explorer(SYSTEMS["pendulum"](), policy="random") as one,
+        pytest.raises(SpecificationError, match="Plant is expected for a log"),
+    ):
+        one.log()
