@@ -17,8 +17,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.arguments import (
+from dopt.arguments import (
     finite,
     instance,
     measured,
@@ -28,6 +27,7 @@ from dopt.explorer.arguments import (
     whole,
     within,
 )
+from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside
 from dopt.explorer.saving import SavedExplored

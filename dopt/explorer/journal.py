@@ -26,8 +26,8 @@ from typing import Any
 
 import numpy as np
 
+from dopt.arguments import finite, seconds, whole, within
 from dopt.errors import ExplorationError, SpecificationError, given_path
-from dopt.explorer.arguments import finite, seconds, whole, within
 from dopt.process import lock_file
 
 FORMAT = 2

@@ -16,7 +16,7 @@ import sys
 import threading
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,12 +26,6 @@ from dopt.log import Log, Piece
 from dopt.spec.scaled import Scaled
 from dopt.systems.plant import Plant, unknown
 from dopt.types import Array
-
-if TYPE_CHECKING:
-    from dopt.explorer.state import ExplorerState
-
-WEIGHTS = (30.0, 10.0, 3.0, 1.0)
-"""Weights s that the fits try (:func:`dopt.fit`)."""
 
 
 class Recording:
@@ -50,22 +44,22 @@ class Recording:
         self._ended = True
         self.rows = self.fitted = 0
 
-    def note(self, event: Event, state: ExplorerState) -> None:
-        """Take in an event before the state changes by it."""
+    def note(self, event: Event, present: Array | None, time: float | None, dt: float) -> None:
+        """Take in an event, given the state before it, its time, and the time of a sample."""
         if "learn" in event:
-            assert state.present is not None
+            assert present is not None
             if self._ended:
-                self._pieces.append(([0.0], [state.present.tolist()], []))
+                self._pieces.append(([0.0], [present.tolist()], []))
                 self._ended = False
-            time, measured, inputs = self._pieces[-1]
-            time.append(time[-1] + event["dt"])
+            times, measured, inputs = self._pieces[-1]
+            times.append(times[-1] + event["dt"])
             measured.append(event["learn"])
             inputs.append(event["applied"])
             self.rows += 1
         elif "begin" in event:
-            again = state.present is not None and event["begin"] == state.present.tolist()
-            late = 0.0 if None in (event["time"], state.time) else event["time"] - state.time
-            if again and not self._ended and 0.0 <= late < 0.5 * state.spec.system.dt:
+            again = present is not None and event["begin"] == present.tolist()
+            late = 0.0 if event["time"] is None or time is None else event["time"] - time
+            if again and not self._ended and 0.0 <= late < 0.5 * dt:
                 self._pieces[-1][0][-1] += late  # the same state, with the time of the question
             else:
                 self._ended = True
@@ -151,18 +145,6 @@ def _first_request() -> tuple[Plant, Log, int, int]:
     return plant, Log.of_pieces(["x"], ["u"], pieces), 1, 0
 
 
-def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
-    from dopt.fitting.fit import fit
-
-    chosen = fit(plant, log, width=width, seed=seed, weights=WEIGHTS, workers=1).chosen
-    values, s = chosen.model.values(chosen.solution.p), chosen.model.structure
-    layout = s.feature_centers, s.feature_scales, values.sizes
-    weights = np.empty(0)
-    if chosen.model.width:
-        weights = np.concatenate([part.ravel() for part in chosen.model.matrices(values.weights)])
-    return Found(values.constants, values.delay, values.lag, weights, *layout)
-
-
 class FitBeside:
     """A process that fits one log at a time.
 
@@ -232,7 +214,7 @@ def _started() -> subprocess.Popen[bytes]:
     paths = os.pathsep.join(path for path in sys.path if path)
     try:
         return subprocess.Popen(
-            [sys.executable, "-c", "from dopt.explorer.refit import serve; serve()"],
+            [sys.executable, "-c", "from dopt.explorer.fit_service import serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": paths},
@@ -248,22 +230,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
     with contextlib.suppress(OSError):
         process.communicate()  # closes the pipes, and waits
-
-
-def serve() -> None:
-    """Answer requests from the standard input until it ends."""
-    with contextlib.suppress(AttributeError, OSError):  # which Windows lacks
-        os.nice(10)  # the exploration comes first
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what is printed does not mix with them
-    while True:
-        try:
-            request = pickle.load(sys.stdin.buffer)  # of the process that began this
-        except EOFError:
-            return
-        try:
-            answer: Found | str = _found(*request)
-        except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
-            answer = str(error)
-        pickle.dump(answer, answers)
-        answers.flush()

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from dopt.arguments import reals, whole
 from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.arguments import reals, whole
 from dopt.explorer.flight import InFlight
 from dopt.explorer.signs import SIGNS
 from dopt.explorer.state import ExplorerState

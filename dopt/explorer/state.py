@@ -198,7 +198,7 @@ class ExplorerState:
 
     def do(self, event: Event) -> None:
         """Change by one event."""
-        self.run.note(event, self)
+        self.run.note(event, self.present, self.time, self.spec.system.dt)
         if "learn" in event:
             self._learn(event)
         elif "plan" in event:

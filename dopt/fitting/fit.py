@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError
-from dopt.explorer.arguments import instance, whole
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of, measured_names
 from dopt.fitting.predictions import (

@@ -1,4 +1,4 @@
-"""Checks of arguments of an explorer."""
+"""Checks of the arguments of explorers and fits."""
 
 from __future__ import annotations
 

@@ -1,0 +1,48 @@
+"""The process that fits beside an exploration: requests come in, and what was found goes out."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import sys
+
+import numpy as np
+
+from dopt.errors import SpecificationError
+from dopt.explorer.refit import Found
+from dopt.fitting.fit import fit
+from dopt.log import Log
+from dopt.systems.plant import Plant
+
+WEIGHTS = (30.0, 10.0, 3.0, 1.0)
+"""Weights s that the fits try (:func:`dopt.fit`)."""
+
+
+def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
+    chosen = fit(plant, log, width=width, seed=seed, weights=WEIGHTS, workers=1).chosen
+    values, s = chosen.model.values(chosen.solution.p), chosen.model.structure
+    layout = s.feature_centers, s.feature_scales, values.sizes
+    weights = np.empty(0)
+    if chosen.model.width:
+        weights = np.concatenate([part.ravel() for part in chosen.model.matrices(values.weights)])
+    return Found(values.constants, values.delay, values.lag, weights, *layout)
+
+
+def serve() -> None:
+    """Answer requests from the standard input until it ends."""
+    with contextlib.suppress(AttributeError, OSError):  # which Windows lacks
+        os.nice(10)  # the exploration comes first
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what is printed does not mix with them
+    while True:
+        try:
+            request = pickle.load(sys.stdin.buffer)  # of the process that began this
+        except EOFError:
+            return
+        try:
+            answer: Found | str = _found(*request)
+        except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
+            answer = str(error)
+        pickle.dump(answer, answers)
+        answers.flush()
