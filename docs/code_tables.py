@@ -19,7 +19,7 @@ from analysis.cli import parser
 from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
-from dopt.explorer.signs import SIGNS
+from dopt.explorer.signs import STORED
 from dopt.fitting.stored import FIT_MEASURES
 from dopt.kernel import plugin
 from dopt.systems import NAMED_SYSTEMS
@@ -181,7 +181,7 @@ def tables() -> str:
 
 
 def measures(of: Mapping[str, str] | None = None) -> str:
-    of = {**MEASURES, **SIGNS} if of is None else of
+    of = {**MEASURES, **STORED} if of is None else of
     rows = [[f"`{name}`", said] for name, said in of.items()]
     return markdown(["measure", "value"], rows)
 

@@ -32,7 +32,7 @@ from analysis.stats.curves import (
 from analysis.stats.intervals import mean_columns
 from analysis.style import policy_style
 from dopt.errors import SpecificationError
-from dopt.explorer.signs import SIGNS
+from dopt.explorer.signs import STORED
 from dopt.spec.config import completed
 from dopt.spec.label import flatten, labels
 from dopt.spec.trial import is_fit, is_prequential, system_of
@@ -418,7 +418,7 @@ def trial(state: ServerState, params: QueryParams) -> Content:
         ],
         "assessments": [] if fit else _table(reader, _ASSESSED, row["trial_id"]),
         "fit": fit,
-        "signs": SIGNS,
+        "signs": STORED,
         "has_arrays": row["status"] in ("done", "diverged"),
         "exploration": running and {"is_running": running.is_running, "state": running.state},
         "system_is_known": system is not None,

@@ -17,7 +17,7 @@ from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.flight import InFlight
-from dopt.explorer.signs import SIGNS
+from dopt.explorer.signs import SIGNS, STORED
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.log import Log
@@ -418,7 +418,7 @@ class SavedExplored(Explored):
             tested += (self._tested(test, n, parameters),)
         if self.spec.limits is not None:
             tested += violations(excess[:n])
-        tested += tuple(Assessment(n, sign, float(counts[sign])) for sign in SIGNS if counts[sign])
+        tested += tuple(Assessment(n, sign, float(counts[sign])) for sign in STORED if counts[sign])
         return TrialResult(
             loss=errors,
             reachable_loss=unknown,

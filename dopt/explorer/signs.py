@@ -1,6 +1,6 @@
 """Signs that an exploration fails: counted by its events alone, and each said once.
 
-Errors are those of accelerations, with their signs, by parameters that are at most 50 steps old.
+Errors are those of accelerations, with their signs, by parameters at most 50 steps old.
 For each learned row and each input the share of their squares is taken that the input of the eight
 steps before explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a
 plant depends that answers at once. Estimated states depend on earlier inputs by their filter: of
@@ -32,6 +32,9 @@ SIGNS = {
     "narrow": "sides of the box of which the first 500 states cover less than a tenth",
 }
 """What is counted of each sign."""
+
+STORED = {name: said for name, said in SIGNS.items() if name != "beyond"}
+"""Signs that are stored by these names; states beyond limits are stored as violations."""
 
 BLOCK = 50
 """Steps after which parameters are compared; one set of parameters predicts so many."""

@@ -40,7 +40,7 @@ CASES = {
         reference=plants.published(plants.PENDULUM, plants.LEADERBOARD),
         horizons=(0.5, 1.0),
         moved=0.3,
-        options={"hold": "linear", "width": 0, "window": 0.3},
+        options={"hold": "linear", "width": 0},
     ),
     "double pendulum": Case(
         plants.DOUBLE_PENDULUM,
@@ -48,7 +48,7 @@ CASES = {
         history=0.2,
         reference=plants.MODEL_2_PLANT,
         horizons=(0.5, 1.0),
-        options={"width": 0, "window": 0.5},
+        options={"width": 0},
     ),
     "double pendulum, commanded torque": Case(
         plants.DOUBLE_PENDULUM,
@@ -56,7 +56,7 @@ CASES = {
         history=0.2,
         reference=plants.MODEL_2_PLANT,
         horizons=(0.5, 1.0),
-        options={"width": 0, "window": 0.5},
+        options={"width": 0},
     ),
     "qube": Case(
         plants.QUBE,
@@ -64,7 +64,7 @@ CASES = {
         history=0.05,
         reference=plants.published(plants.QUBE, plants.QUANSER),
         horizons=(0.1, 0.2),
-        options={"width": 0, "window": 0.4},
+        options={"width": 0},
     ),
 }
 """What is fitted, by the name in ``--only``."""

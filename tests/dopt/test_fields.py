@@ -42,7 +42,7 @@ iterations frequency band subspace count radius stride plans elites samples n_li
 time_constant capacity refit_every replan_every members refresh_every batch steps noise_variance
 forgetting dry_rate motor_gain measurement_noise velocity_cutoff core period front rear slip_speed
 motor steering steering_time inertia_z propeller_torque slow_speed slow_rate warm_up updates units
-fit_updates actors episodes entropy_weight
+fit_updates actors episodes entropy_weight first_rows growth
 """
 POSITIVE = set(POSITIVE_NAMES.split())
 NONNEGATIVE_NAMES = """
@@ -53,7 +53,7 @@ strength orbit spread front_grip rear_grip turn_drag
 NONNEGATIVE = set(NONNEGATIVE_NAMES.split())
 FRACTIONS = {"beta_1", "beta_2", "discount"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states", "information", "domain", "integrator"}
+TEXTS = {"form", "criterion", "states", "information", "domain", "integrator", "overshoot"}
 LISTED_TEXTS = {"unknown"}
 OF_ANY_SIZE = {"goal", "initial"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
