@@ -77,10 +77,14 @@ def first_fitting(env_policies: list[tuple[str, str]], learner: str, form: str) 
     return next((spec for spec in found if spec is not None), None)
 
 
+OF_TRIALS = [name for name in LEARNERS if name != "simulation_error"]
+"""Learners that do without a :class:`dopt.Plant`, which is measured and not simulated."""
+
+
 def cases() -> Iterator[tuple[str, TrialSpec]]:
     """Yield every learner in every form of M that a policy with it can hold, and every policy."""
     forms = [name for name in POLICIES if hasattr(POLICIES[name], "sketch_size")]
-    for learner in [name for name in LEARNERS if name != "simulation_error"]:  # of explorations
+    for learner in OF_TRIALS:
         for form in FORMS:
             spec = first_fitting([(env, name) for env in ENVS for name in forms], learner, form)
             if spec is not None:
@@ -240,7 +244,7 @@ def test_every_choice_runs_and_agrees_where_both_paths_run_it(name: str) -> None
 def test_the_cases_cover_the_registries_and_the_forms() -> None:
     specs = list(CASES.values())
     assert {spec.policy.name for spec in specs} == set(POLICIES)
-    assert {spec.learner.name for spec in specs} == set(LEARNERS)
+    assert {spec.learner.name for spec in specs} == set(OF_TRIALS)
     assert {spec.model.name for spec in specs} == set(MODELS)
     held = {
         held_information(spec.policy, spec.learner, 1, 1)
