@@ -44,5 +44,8 @@ def serve() -> None:
             answer: Found | str = _found(*request)
         except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
             answer = str(error)
-        pickle.dump(answer, answers)
-        answers.flush()
+        try:
+            pickle.dump(answer, answers)
+            answers.flush()
+        except BrokenPipeError:  # the exploration has ended
+            os._exit(0)  # without another attempt to flush
