@@ -218,7 +218,7 @@ class Explorer(SavedExplored):
         )
         instance("journal", journal, str | Path | None, "the path of a file")
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
-        if SimulationError.name in (learner, *_named(learner)):
+        if _name_of(learner) == SimulationError.name:
             model = {"name": "mlp", "depth": 1} if model is None else model
             plant = (
                 dataclasses.replace(plant, integrator="rk4") if isinstance(plant, Plant) else plant
@@ -526,9 +526,9 @@ class Explorer(SavedExplored):
         self.close()
 
 
-def _named(part: object) -> tuple[object, ...]:
-    """Return the name of a section or an object, if it has one."""
-    return (part.get("name"),) if isinstance(part, Mapping) else (getattr(part, "name", None),)
+def _name_of(part: object) -> object:
+    """Return the name of a section or an object, or the name itself."""
+    return part.get("name") if isinstance(part, Mapping) else getattr(part, "name", part)
 
 
 def _about(spec: TrialSpec) -> Event:

@@ -1,10 +1,10 @@
 """Signs that an exploration fails: counted by its events alone, and each said once.
 
-Errors are those of accelerations, with their signs, by parameters at most 50 steps old.
-For each learned row and each input the share of their squares is taken that the input of the eight
-steps before explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a
-plant depends that answers at once. Estimated states depend on earlier inputs by their filter: of
-these there is no such test.
+Errors are of accelerations, with their signs, by parameters at most 50 steps old. For each learned
+row and each input the share of their squares is taken that the input of the eight steps before
+explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a plant depends
+that answers at once. Estimated states depend on earlier inputs by their filter: of these there is
+no such test.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _TEXTS = {
     "unmoved": "no parameter moved in the last 100 learned steps, but each step is expected to "
     "correct the model (%s): raise the regularization or the noise variance of the learner, or "
     "take another one such as 'adam_window'",
-    "late": "the errors of the predictions follow from inputs of earlier steps, most from that of "
+    "late": "the errors of the predictions follow from inputs of earlier steps, most from the one "
     "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
     "once, or as declared: declare Plant(delay=..., lag=...)",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
@@ -122,7 +122,7 @@ class Signs:
         self._parameters: Array | None = None  # at the beginning of the block
         self._still = 0  # blocks in a row that left them as they were
         self._start = 0  # first of the steps that followed each other
-        self._steps: list[tuple[int, float]] = []  # that of each step, and its time
+        self._steps: list[tuple[int, float]] = []  # the start of each step, and its time
         self._models: list[Array] = []  # parameters at the beginning of each block of them
         self._rows: list[tuple[Array, ...]] = []  # of the next test
         self._told: set[str] = set()

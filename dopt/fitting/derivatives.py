@@ -34,7 +34,7 @@ def differentiated_text(
         n expressions, which :func:`dopt.systems.expressions.compiled_text` has accepted.
     arguments : mapping of str to sequence of str
         Arguments of the function, each an array of named quantities. Two more are written: (n,)
-        values and (n, k) derivatives, but for those that are always 0.
+        values and (n, k) derivatives, except where they are always 0.
     by : sequence of str
         k quantities; for none of them there are no derivatives to write.
 

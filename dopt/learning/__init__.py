@@ -10,8 +10,8 @@ from dopt.learning.least_squares import (
     GaussNewton,
     JointKalman,
     RecursiveLeastSquares,
+    SimulationError,
 )
-from dopt.learning.simulation_error import SimulationError
 
 LEARNERS: dict[str, type[Learner]] = {
     learner.name: learner
