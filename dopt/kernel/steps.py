@@ -313,7 +313,7 @@ class SteppedTrial(KernelSteps):
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
         shared = shared_points(spec.config)
-        self.points = points_of_trial(shared, self.trial.network, spec.system.horizon)
+        self.points = points_of_trial(shared, self.trial.network)
         self.done = 0
         self.diverged_at: int | None = None
         self._evaluate = compiled_evaluation(self.trial, self.points)

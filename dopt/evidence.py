@@ -1,0 +1,103 @@
+"""Fits of the kernels of Gaussian processes by their evidence.
+
+The logarithms η of the numbers of a kernel (:mod:`dopt.kernel.gaussian_process`) minimise
+-log p(y | η) beside a weak prior, each normal about a guess that the sizes of the accelerations
+give: a few samples cannot decide about all numbers. The derivatives are exact, the minimiser is
+L-BFGS-B of SciPy. Reference: C. Rasmussen and C. Williams, "Gaussian processes for machine
+learning" (2006), section 5.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from dopt.kernel.gaussian_process import negative_evidence
+from dopt.kernel.pointers import compiled_for, kind_of
+from dopt.models.gaussian_process import ROUNDING
+from dopt.types import Array
+
+SPREADS = (2.0, 4.0, 4.0, 4.0, 4.0)
+"""Standard deviations of the logarithms of w, s², l, c and ν."""
+
+GUESSES = (1.0, 1.0, 0.1, 0.1, 1e-4)
+"""Guesses of w, s², l, c and ν, but w in units of the mean square of the accelerations."""
+
+FARTHEST = 6.0
+"""Bounds of the logarithms, in their standard deviations."""
+
+
+def guessed(phi: Array, y: Array) -> Array:
+    """Return the guess of the numbers, (2p + 3,), for features (p, n) and accelerations (n,)."""
+    size = float(np.mean(y**2)) or 1.0
+    w, s, slope, constant, noise = GUESSES
+    p = len(phi)
+    return np.array([w] * p + [s * size] + [slope * size] * p + [constant * size, noise * size])
+
+
+def fit_numbers(
+    phi: Array,
+    y: Array,
+    counts: Array,
+    starts: Sequence[Array],
+    noise: float | None,
+    most_steps: int,
+) -> Array:
+    """Return the numbers of a kernel, (2p + 3,), with the largest evidence that a fit has found.
+
+    Parameters
+    ----------
+    phi : (p, n)
+        Features of the samples.
+    y : (n,)
+        Accelerations of one row.
+    counts : (n,)
+        Observations of which each sample is the mean.
+    starts : sequence of (2p + 3,)
+        Numbers from which a fit starts.
+    noise : float or None
+        Variance ν of an observation, if it is known.
+    most_steps : int
+        Most iterations of a fit.
+    """
+    p, guess = len(phi), np.log(guessed(phi, y))
+    spread = np.repeat(SPREADS, (p, 1, p, 1, 1))
+    free = np.arange(2 * p + (3 if noise is None else 2))
+    code: Any = compiled_for("negative_evidence", negative_evidence, _kinds(phi, y))
+    phi, y = np.ascontiguousarray(phi), np.ascontiguousarray(y)
+
+    def cost(eta: Array) -> tuple[float, Array]:
+        numbers, slope = completed(eta), np.empty(2 * p + 3)
+        value = code(numbers, phi, y, counts, slope)
+        if not np.isfinite(value):
+            return 1e10, np.zeros(len(free))
+        apart = (eta - guess[free]) / spread[free]
+        return value + 0.5 * float(apart @ apart), slope[free] + apart / spread[free]
+
+    def completed(eta: Array) -> Array:
+        numbers = np.exp(np.concatenate([eta, guess[len(free) :]]))
+        least = ROUNDING * (numbers[p] + numbers[p + 1 : 2 * p + 2].sum())
+        numbers[-1] = max(numbers[-1] if noise is None else noise, least)
+        return numbers
+
+    reach = FARTHEST * spread[free]
+    lower, upper = guess[free] - reach, guess[free] + reach
+    found = [
+        minimize(
+            cost,
+            np.clip(np.log(np.maximum(start[free], 1e-300)), lower, upper),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=list(zip(lower, upper, strict=True)),
+            options={"maxiter": most_steps, "maxfun": 2 * most_steps},
+        )
+        for start in starts
+    ]
+    return completed(min(found, key=lambda one: one.fun).x)
+
+
+def _kinds(phi: Array, y: Array) -> tuple[Any, ...]:
+    return tuple(map(kind_of, (y, np.zeros((1, 1)), y, y, y)))
