@@ -13,12 +13,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from dopt.kernel.gaussian_process import negative_evidence
 from dopt.kernel.pointers import compiled_for, kind_of
-from dopt.models.gaussian_process import ROUNDING
-from dopt.types import Array
+from dopt.models.gaussian_process import ROUNDING, GaussianProcess, kernel
+from dopt.randomness import stream
+from dopt.systems.base import System
+from dopt.types import Array, Integers
 
 SPREADS = (2.0, 4.0, 4.0, 4.0, 4.0)
 """Standard deviations of the logarithms of w, s², l, c and ν."""
@@ -97,6 +100,58 @@ def fit_numbers(
         for start in starts
     ]
     return completed(min(found, key=lambda one: one.fun).x)
+
+
+def fit_process(
+    model: GaussianProcess, system: System, states: Array, accelerations: Array, seed: int
+) -> Array:
+    """Return the parameters of a process, (q,), fitted to samples: its kernels and its mean.
+
+    A fit of the evidence starts from a guess and from random numbers, on an even choice of the
+    samples, and goes on with all of them. Of more samples than there is room for the process takes
+    an even choice.
+
+    Parameters
+    ----------
+    model : GaussianProcess
+    system : System
+    states : (N, d)
+    accelerations : (N, r)
+    seed : int
+        Seed of the trial, from which the random numbers come.
+    """
+    rng, C = stream(seed, "evidence"), model.room(system)
+    chosen = evenly(len(states), C)
+    phi, targets = system.featurize(states[chosen]).T.copy(), accelerations[chosen].T.copy()
+    (p, n), r = phi.shape, system.n_learned
+    parameters = model.initial_parameters(system, rng)
+    parameters[: p * C].reshape(p, C)[:, :n] = phi
+    known = model.noise_variance(system) if model.noise == "known" else None
+    few = evenly(n, FEW)
+    for k, y in enumerate(targets):
+        numbers = model.fixed_numbers(system)
+        if model.is_tuned:
+            guess = guessed(phi, y)
+            starts = [guess, guess * np.exp(rng.standard_normal(len(guess)))]
+            numbers = fit_numbers(phi[:, few], y[few], np.ones(len(few)), starts, known, 2 * MOST)
+            if len(few) < n:
+                numbers = fit_numbers(phi, y, np.ones(n), [numbers], known, MOST)
+            parameters[(p + r) * C :].reshape(r, -1)[k] = numbers
+        K = kernel(numbers, phi.T, phi.T) + numbers[-1] * np.eye(n)
+        parameters[(p + k) * C : (p + k) * C + n] = cho_solve(cho_factor(K), y)
+    return parameters
+
+
+FEW = 150
+"""Samples of the first part of a fit."""
+
+MOST = 20
+"""Iterations of its second part."""
+
+
+def evenly(count: int, most: int) -> Integers:
+    """Return at most so many places of a number of samples, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def _kinds(phi: Array, y: Array) -> tuple[Any, ...]:

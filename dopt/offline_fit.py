@@ -29,6 +29,7 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, random_transitions
 from dopt.models.base import Model
+from dopt.models.gaussian_process import GaussianProcess
 from dopt.models.networks import MLP
 from dopt.policies.base import ball_norms, on_sphere
 from dopt.randomness import initial_weights, process_noise, stream
@@ -231,10 +232,16 @@ def fit_offline(
         parameters, steps, converged = _fit_networks(spec, points, y, initial, ridge, max_steps)
     elif spec.model.structure == "least_squares":
         parameters, steps, converged = _solve(spec, x, u, y, initial, ridge), 1, True
+    elif isinstance(spec.model, GaussianProcess):
+        from dopt.evidence import fit_process
+
+        parameters = fit_process(spec.model, spec.system, x, y, spec.seed)
+        steps, converged = 1, True
     else:
         raise SpecificationError(
-            f"model '{spec.model.name}' has no offline fit, but 'mlp', 'ensemble', or a model that "
-            f"is linear in its parameters, is expected: choose one of these."
+            f"model '{spec.model.name}' has no offline fit, but 'mlp', 'ensemble', "
+            f"'gaussian_process', or a model that is linear in its parameters, is expected: choose "
+            f"one of these."
         )
     residual = _root_mean_square(spec.model.predict(spec.system, parameters, x, u) - y)
     return OfflineFit(parameters, grid_loss(spec, parameters), residual, steps, converged)

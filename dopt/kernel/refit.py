@@ -43,7 +43,7 @@ class Evidence:
         assert isinstance(spec.learner, Conditioning)
         assert isinstance(spec.model, GaussianProcess)
         self._spec, self._trial, self._learner, self._model = spec, trial, spec.learner, spec.model
-        self._rng, self._done = stream(spec.seed, "updater"), 0
+        self._rng, self._done = stream(spec.seed, "evidence"), 0
         self.due = spec.learner.next_fit(0)
 
     @property

@@ -81,10 +81,10 @@ class Conditioning(Learner):
 
     Parameters
     ----------
-    first_fit : int
+    first_rows : int
         Samples of the first fit of the evidence.
     growth : float
-        Factor of the number of samples from one fit to the next, above 1.
+        New samples after which another fit begins, by the samples that the last one had.
     """
 
     name: ClassVar[str] = "conditioning"
@@ -92,12 +92,12 @@ class Conditioning(Learner):
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.condition"
 
-    first_fit: int = parameter(10, "samples", "positive", added=True)
-    growth: float = parameter(1.25, bound="positive", added=True)
+    first_rows: int = parameter(10, "samples", "positive", added=True)
+    growth: float = parameter(0.25, bound="positive", added=True)
 
     def next_fit(self, samples: int) -> int:
         """Return with how many samples the fit after one with so many is due; 0: the first one."""
-        return max(self.first_fit, math.ceil(samples * self.growth), samples + 1)
+        return max(self.first_rows, math.ceil((1.0 + self.growth) * samples), samples + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
