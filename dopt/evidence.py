@@ -10,14 +10,12 @@ learning" (2006), section 5.4.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from dopt.kernel.gaussian_process import negative_evidence
-from dopt.kernel.pointers import compiled_for, kind_of
 from dopt.models.gaussian_process import ROUNDING, GaussianProcess, kernel
 from dopt.randomness import stream
 from dopt.systems.base import System
@@ -66,10 +64,14 @@ def fit_numbers(
     most_steps : int
         Most iterations of a fit.
     """
+    from dopt.kernel.gaussian_process import negative_evidence  # which loads the compiler
+    from dopt.kernel.pointers import compiled_for, kind_of
+
     p, guess = len(phi), np.log(guessed(phi, y))
     spread = np.repeat(SPREADS, (p, 1, p, 1, 1))
     free = np.arange(2 * p + (3 if noise is None else 2))
-    code: Any = compiled_for("negative_evidence", negative_evidence, _kinds(phi, y))
+    kinds = tuple(map(kind_of, (y, np.zeros((1, 1)), y, y, y)))
+    code: Any = compiled_for("negative_evidence", negative_evidence, kinds)
     phi, y = np.ascontiguousarray(phi), np.ascontiguousarray(y)
 
     def cost(eta: Array) -> tuple[float, Array]:
@@ -102,6 +104,37 @@ def fit_numbers(
     return completed(min(found, key=lambda one: one.fun).x)
 
 
+class Request(NamedTuple):
+    """Samples of all rows, and where the fits start.
+
+    Attributes
+    ----------
+    phi : (p, n)
+    targets : (r, n)
+    counts : (n,)
+    starts : (r, k, 2p + 3)
+    noise : float or None
+        As of :func:`fit_numbers`.
+    """
+
+    phi: Array
+    targets: Array
+    counts: Array
+    starts: Array
+    noise: float | None
+
+
+def fit_rows(request: Request) -> Array:
+    """Return the numbers of the kernel of each row, (r, 2p + 3)."""
+    phi, targets, counts, starts, noise = request
+    rows = zip(targets, starts, strict=True)
+    return np.array([fit_numbers(phi, y, counts, at, noise, MOST_STEPS) for y, at in rows])
+
+
+MOST_STEPS = 30
+"""Iterations of a fit in a trial."""
+
+
 def fit_process(
     model: GaussianProcess, system: System, states: Array, accelerations: Array, seed: int
 ) -> Array:
@@ -126,7 +159,7 @@ def fit_process(
     (p, n), r = phi.shape, system.n_learned
     parameters = model.initial_parameters(system, rng)
     parameters[: p * C].reshape(p, C)[:, :n] = phi
-    known = model.noise_variance(system) if model.noise == "known" else None
+    known = model.known_noise(system)
     few = evenly(n, FEW)
     for k, y in enumerate(targets):
         numbers = model.fixed_numbers(system)
@@ -152,7 +185,3 @@ MOST = 20
 def evenly(count: int, most: int) -> Integers:
     """Return at most so many places of a number of samples, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
-
-
-def _kinds(phi: Array, y: Array) -> tuple[Any, ...]:
-    return tuple(map(kind_of, (y, np.zeros((1, 1)), y, y, y)))

@@ -40,6 +40,9 @@ from dopt.kernel.structs import Evaluation, Network, Posterior, State
 from dopt.kernel.vectors import add_multiple, inner, multiply_add
 from dopt.types import Matrix, Vector
 
+LITTLE = 0.1
+"""Variance of what a sample shows, in units of its noise, below which it adds little."""
+
 SMALLEST_EXPONENT = -700.0
 """Below it exp is taken as at it, 1e-304."""
 
@@ -157,11 +160,17 @@ def write_means(network: Network, theta: Vector, states: Matrix, outputs: Matrix
 def add_sample(
     network: Network, theta: Vector, posterior: Posterior, x: Vector, target: Vector
 ) -> None:
-    """Add the accelerations observed at a state, (r,): a row of each L and of z, and all of α."""
-    n, r = network.process.n_samples[0], target.shape[0]
+    """Add the accelerations observed at a state, (r,): a row of each L and of z, and all of α.
+
+    Where not all samples of the horizon have room, one that adds little information is merged.
+    """
+    n, r, process = network.process.n_samples[0], target.shape[0], network.process
     phi, p = np.empty(network.sizes[0]), network.sizes[0]
     features_at(network, x, phi)
-    numbers, others = numbers_of(network, theta, r), sample_features(network, theta)
+    if n == process.room:
+        _merge(network, theta, posterior, phi, target)
+        return
+    numbers, others, added = numbers_of(network, theta, r), sample_features(network, theta), 0.0
     for g in range(numbers.shape[0]):
         factor = posterior.factors[g]
         row = factor[n, :n]
@@ -171,6 +180,10 @@ def add_sample(
         # The variance of a new observation is at least the variance of its noise.
         rest = prior_variance(numbers[g], phi) + noise - inner(row, row)
         factor[n, n] = np.sqrt(max(rest, noise))
+        added = max(added, rest / noise - 1.0)
+    if n >= process.selects_from and added < LITTLE:
+        _merge(network, theta, posterior, phi, target)
+        return
     posterior.counts[n] = 1.0
     for k in range(r):
         posterior.targets[k, n] = target[k]
@@ -182,6 +195,36 @@ def add_sample(
         known = inner(factor[n, :n], posterior.solved[k, :n])
         posterior.solved[k, n] = (target[k] - known) / factor[n, n]
     _write_weights(network, theta, posterior, r)
+
+
+@compiled
+def _merge(
+    network: Network, theta: Vector, posterior: Posterior, phi: Vector, target: Vector
+) -> None:
+    """Make accelerations, (r,), part of the mean of the nearest sample.
+
+    They are moved there by what the model says; they count from the next :func:`refactor` on.
+    """
+    n, r, p = network.process.n_samples[0], target.shape[0], phi.shape[0]
+    numbers, others = numbers_of(network, theta, r), sample_features(network, theta)
+    nearest, least, row = 0, np.inf, np.empty(n)
+    here, there, at = np.empty(r), np.empty(r), np.empty(p)
+    for i in range(n):
+        square = 0.0
+        for j in range(p):
+            apart = others[j, i] - phi[j]
+            square += numbers[:, j].sum() * apart * apart
+        if square < least:
+            nearest, least = i, square
+    for j in range(p):
+        at[j] = others[j, nearest]
+    write_mean_at(network, theta, phi, row, here)
+    write_mean_at(network, theta, at, row, there)
+    count = posterior.counts[nearest]
+    for k in range(r):
+        mean = posterior.targets[k, nearest]
+        posterior.targets[k, nearest] += (target[k] - here[k] + there[k] - mean) / (count + 1.0)
+    posterior.counts[nearest] = count + 1.0
 
 
 @compiled
@@ -338,7 +381,9 @@ def information(numbers: Matrix, features: Matrix, rows: Matrix, a: int, b: int)
 
 
 @compiled
-def posterior_covariance(numbers: Vector, a: Vector, b: Vector, of_a: Vector, of_b: Vector) -> float:
+def posterior_covariance(
+    numbers: Vector, a: Vector, b: Vector, of_a: Vector, of_b: Vector
+) -> float:
     """Return the covariance of a row at features (p,), given L⁻¹k, (n,), of both."""
     p, square, value = a.shape[0], 0.0, numbers[2 * a.shape[0] + 1]
     for j in range(p):

@@ -7,7 +7,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from dopt.evidence import fit_numbers, guessed
+from dopt.evidence import Request, evenly, fit_rows, guessed
 from dopt.kernel.gaussian_process import refactor
 from dopt.kernel.pointers import compiled_for, kind_of
 from dopt.kernel.structs import Evaluation, Trial
@@ -18,9 +18,6 @@ from dopt.randomness import stream
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 
-MOST_STEPS = 30
-"""Iterations of a fit."""
-
 FITS_WITH_RESTARTS = 4
 """First fits, of few samples, that also start from guesses."""
 
@@ -30,6 +27,10 @@ def is_tuned(model: Model) -> TypeGuard[GaussianProcess]:
     return isinstance(model, GaussianProcess) and model.is_tuned
 
 
+MOST_FITTED = 1000
+"""Most samples of a fit; of more it takes an even choice."""
+
+
 class Evidence:
     """The fits of one trial.
 
@@ -37,46 +38,55 @@ class Evidence:
     ----------
     due : int
         Number of samples with which the next fit is due.
+    numbers : (r, 2p + 3)
+        Numbers of the kernels, a view of the parameters.
     """
 
     def __init__(self, spec: TrialSpec, trial: Trial) -> None:
         assert isinstance(spec.learner, Conditioning)
         assert isinstance(spec.model, GaussianProcess)
-        self._spec, self._trial, self._learner, self._model = spec, trial, spec.learner, spec.model
-        self._rng, self._done = stream(spec.seed, "evidence"), 0
-        self.due = spec.learner.next_fit(0)
+        self._trial, self._learner = trial, spec.learner
+        self._noise = spec.model.known_noise(spec.system)
+        r, size = spec.system.n_learned, 2 * len(spec.system.features) + 3
+        self.numbers = trial.state.theta[-r * size :].reshape(r, size)
+        self._normals = stream(spec.seed, "evidence").standard_normal((FITS_WITH_RESTARTS, r, size))
+        self._done, self.due = 0, spec.learner.next_fit(0)
 
     @property
-    def numbers(self) -> Array:
-        """Numbers of the kernels, (r, 2p + 3), a view of the parameters."""
-        r = self._spec.system.n_learned
-        size = r * (2 * len(self._spec.system.features) + 3)
-        view: Array = self._trial.state.theta[-size:].reshape(r, -1)
-        return view
+    def samples(self) -> int:
+        """Number of samples taken."""
+        return int(self._trial.network.process.n_samples[0])
 
-    def fit(self, points: Evaluation | None = None) -> float:
+    def request(self) -> Request:
+        """Return what the next fit needs: a copy, and the samples go on."""
+        network, state, n = self._trial.network, self._trial.state, self.samples
+        p = network.sizes[0]
+        chosen = evenly(n, MOST_FITTED)
+        phi = state.theta[: p * network.process.room].reshape(p, -1)[:, chosen]
+        targets, starts = state.posterior.targets[:, chosen], self.numbers[:, None].copy()
+        if self._done < FITS_WITH_RESTARTS:
+            guesses = np.array([guessed(phi, y) for y in targets])[:, None]
+            drawn = guesses * np.exp(self._normals[self._done][:, None])
+            starts = np.concatenate([*([starts] if self._done else []), guesses, drawn], axis=1)
+        return Request(phi, targets, state.posterior.counts[chosen], starts, self._noise)
+
+    def take(self, numbers: Array, samples: int) -> None:
+        """Let the numbers of a fit to so many samples come into force."""
+        network, theta, posterior = (
+            self._trial.network,
+            self._trial.state.theta,
+            self._trial.state.posterior,
+        )
+        self.numbers[:] = numbers
+        kinds = tuple(map(kind_of, (network, theta, posterior)))
+        code: Any = compiled_for("refactor", refactor, kinds)
+        code(network, theta, posterior)
+        self._done += 1
+        self.due = self._learner.next_fit(samples)
+
+    def fit(self, points: Evaluation) -> float:
         """Fit the kernels to all samples, and return the time that it took [µs]."""
         begun = time.perf_counter()
-        network, state = self._trial.network, self._trial.state
-        n, p = int(network.process.n_samples[0]), network.sizes[0]
-        phi = state.theta[: p * network.process.room].reshape(p, -1)[:, :n]
-        counts, known = state.posterior.counts[:n], None
-        if self._model.noise == "known":
-            known = self._model.noise_variance(self._spec.system)
-        for row, y in zip(self.numbers, state.posterior.targets[:, :n], strict=True):
-            starts = [row.copy()]
-            if self._done < FITS_WITH_RESTARTS:
-                guess = guessed(phi, y)
-                starts += [guess, guess * np.exp(self._rng.standard_normal(len(guess)))]
-            if self._done == 0:
-                starts = starts[1:]
-            row[:] = fit_numbers(phi, y, counts, starts, known, MOST_STEPS)
-        code: Any = compiled_for(
-            "refactor", refactor, tuple(map(kind_of, (network, state.theta, state.posterior)))
-        )
-        code(network, state.theta, state.posterior)
-        if points is not None:
-            points.n_basis[0] = 0
-        self._done += 1
-        self.due = self._learner.next_fit(n)
+        self.take(fit_rows(self.request()), self.samples)
+        points.n_basis[0] = 0
         return 1e6 * (time.perf_counter() - begun)

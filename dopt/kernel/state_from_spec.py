@@ -82,7 +82,8 @@ def _process(system: System, model: Model) -> args.Process:
         room = model.room(system)
         if not model.is_tuned:
             shared = model.fixed_numbers(system)[None]
-    return args.Process(shared, room, np.zeros(1, dtype=np.int64))
+    selects_from = room if room == system.horizon else room // 2
+    return args.Process(shared, room, selects_from, np.zeros(1, dtype=np.int64))
 
 
 def network_of_trial(spec: TrialSpec, network: args.Network, weights: Vector) -> args.Network:

@@ -202,6 +202,7 @@ class Process(NamedTuple):
 
     shared: Matrix  # (1, 2p + 3), numbers of the kernel of all rows; (0, ·) where θ holds them
     room: int  # C
+    selects_from: int  # samples from which on one that adds little is merged; C where all have room
     n_samples: Integers  # (1,)
 
 

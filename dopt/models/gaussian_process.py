@@ -47,7 +47,7 @@ class GaussianProcess(Model):
         Whether the kernel stays.
     noise : {"known", "fitted"}
         Whether ν is the trial's variance of an observed acceleration, σ²/dt, or one more number
-        that the evidence chooses.
+        that the evidence chooses, as it does where σ is 0, such as for a plant.
     """
 
     name: ClassVar[str] = "gaussian_process"
@@ -96,6 +96,11 @@ class GaussianProcess(Model):
         phi = system.featurize(points)
         rows = zip(numbers, alpha.reshape(r, C), strict=True)
         return np.stack([kernel(n, phi, centers.T) @ weights for n, weights in rows], axis=-1)
+
+    def known_noise(self, system: System) -> float | None:
+        """Return ν, None where the evidence chooses it."""
+        known = self.noise == "known" and system.noise > 0.0
+        return self.noise_variance(system) if known else None
 
     def noise_variance(self, system: System) -> float:
         """Return σ²/dt, or what rounding needs if that is more."""

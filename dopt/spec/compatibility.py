@@ -14,8 +14,8 @@ import functools
 import math
 from typing import NamedTuple, TypeGuard
 
-from dopt.errors import IncompatibleError
 from dopt.algorithm import Score
+from dopt.errors import IncompatibleError
 from dopt.learning import (
     LEARNERS,
     Adam,

@@ -23,7 +23,7 @@ from dopt.kernel.linear_algebra import (
 )
 from dopt.kernel.model import parameter_rows, sampled_state, write_jacobian
 from dopt.kernel.structs import Covariance, Network, Plant, Trial
-from dopt.kernel.vectors import LANES, add_multiple, inner
+from dopt.kernel.vectors import LANES, add_multiple
 from dopt.types import Matrix, Vector
 
 
