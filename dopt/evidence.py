@@ -65,13 +65,13 @@ def fit_numbers(
         Most iterations of a fit.
     """
     from dopt.kernel.gaussian_process import negative_evidence  # which loads the compiler
-    from dopt.kernel.pointers import compiled_for, kind_of
+    from dopt.kernel.pointers import compiled_for, kind_of, path_of
 
     p, guess = len(phi), np.log(guessed(phi, y))
     spread = np.repeat(SPREADS, (p, 1, p, 1, 1))
     free = np.arange(2 * p + (3 if noise is None else 2))
     kinds = tuple(map(kind_of, (y, np.zeros((1, 1)), y, y, y)))
-    code: Any = compiled_for("negative_evidence", negative_evidence, kinds)
+    code: Any = compiled_for(path_of(negative_evidence), negative_evidence, kinds)
     phi, y = np.ascontiguousarray(phi), np.ascontiguousarray(y)
 
     def cost(eta: Array) -> tuple[float, Array]:

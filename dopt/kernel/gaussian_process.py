@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.compiler import called_from_python, compiled, copy_into, power_of_two
+from dopt.kernel.compiler import called_from_python, compiled, copy_into, power_of_two, squared
 from dopt.kernel.linear_algebra import (
     factorize,
     solve_columns,
@@ -212,8 +212,7 @@ def _merge(
     for i in range(n):
         square = 0.0
         for j in range(p):
-            apart = others[j, i] - phi[j]
-            square += numbers[:, j].sum() * apart * apart
+            square += numbers[:, j].sum() * squared(others[j, i] - phi[j])
         if square < least:
             nearest, least = i, square
     for j in range(p):
@@ -225,6 +224,76 @@ def _merge(
         mean = posterior.targets[k, nearest]
         posterior.targets[k, nearest] += (target[k] - here[k] + there[k] - mean) / (count + 1.0)
     posterior.counts[nearest] = count + 1.0
+
+
+@called_from_python
+def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
+    """Keep the samples that add most information, half of the room; merge the others into them.
+
+    Each next sample is the one with the largest variance in units of the noise, given those before
+    it, up to :data:`LITTLE`. Call :func:`refactor` afterwards.
+    """
+    n, r, p = network.process.n_samples[0], posterior.targets.shape[0], network.sizes[0]
+    keep, at, targets = network.process.selects_from, np.empty(p), posterior.targets
+    if n <= keep or keep == network.process.room:
+        return
+    numbers, phi = numbers_of(network, theta, r), sample_features(network, theta)
+    G, rows, means = numbers.shape[0], np.zeros((numbers.shape[0], keep, n)), np.empty((r, n))
+    left, chosen, taken = np.empty((G, n)), np.empty(keep, np.int64), np.zeros(n, np.bool_)
+    row, value = np.empty(n), np.empty(r)
+    for i in range(n):
+        for j in range(p):
+            at[j] = phi[j, i]
+        write_mean_at(network, theta, at, row, value)
+        means[:, i] = value
+        for g in range(G):
+            left[g, i] = prior_variance(numbers[g], at) / numbers[g, 2 * p + 2]
+    m = 0
+    while m < keep:
+        best = 0
+        for i in range(n):
+            if taken[best] or (not taken[i] and left[:, i].max() > left[:, best].max()):
+                best = i
+        if taken[best] or left[:, best].max() < LITTLE:
+            break
+        taken[best], chosen[m] = True, best
+        for j in range(p):
+            at[j] = phi[j, best]
+        for g in range(G):
+            row, noise = rows[g, m], numbers[g, 2 * p + 2]
+            write_kernel(numbers[g], at, phi, 0, row)
+            for k in range(m):
+                add_multiple(row, -rows[g, k, best], rows[g, k])
+            scale = 1.0 / np.sqrt(noise * (left[g, best] + 1.0 / posterior.counts[best]))
+            for i in range(n):
+                row[i] *= scale
+                left[g, i] -= row[i] * row[i] / noise
+        m += 1
+    for i in range(n):
+        if taken[i]:
+            continue
+        nearest, least = chosen[0], np.inf
+        for one in chosen[:m]:
+            square = 0.0
+            for j in range(p):
+                square += numbers[:, j].sum() * squared(phi[j, one] - phi[j, i])
+            if square < least:
+                nearest, least = one, square
+        share = posterior.counts[i] / (posterior.counts[nearest] + posterior.counts[i])
+        for k in range(r):
+            moved = targets[k, i] - means[k, i] + means[k, nearest]
+            targets[k, nearest] += share * (moved - targets[k, nearest])
+        posterior.counts[nearest] += posterior.counts[i]
+    order = np.sort(chosen[:m])
+    for i in range(m):
+        posterior.counts[i] = posterior.counts[order[i]]
+        for k in range(r):
+            targets[k, i] = targets[k, order[i]]
+        for j in range(p):
+            phi[j, i] = phi[j, order[i]]
+    phi[:, m:n] = 0.0
+    mean_weights(network, theta, r)[:, m:n] = 0.0
+    network.process.n_samples[0] = m
 
 
 @compiled

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 
 from dopt.evidence import Request, evenly, fit_rows, guessed
-from dopt.kernel.gaussian_process import refactor
-from dopt.kernel.pointers import compiled_for, kind_of
+from dopt.kernel.gaussian_process import refactor, thin
+from dopt.kernel.pointers import compiled_for, kind_of, path_of
 from dopt.kernel.structs import Evaluation, Trial
 from dopt.learning import Conditioning
 from dopt.models.base import Model
 from dopt.models.gaussian_process import GaussianProcess
 from dopt.randomness import stream
 from dopt.spec.trial import TrialSpec
-from dopt.types import Array
+from dopt.types import Array, CompiledFunction
 
 FITS_WITH_RESTARTS = 4
 """First fits, of few samples, that also start from guesses."""
@@ -37,7 +37,7 @@ class Evidence:
     Attributes
     ----------
     due : int
-        Number of samples with which the next fit is due.
+        Number of steps after which the next fit is due.
     numbers : (r, 2p + 3)
         Numbers of the kernels, a view of the parameters.
     """
@@ -52,14 +52,10 @@ class Evidence:
         self._normals = stream(spec.seed, "evidence").standard_normal((FITS_WITH_RESTARTS, r, size))
         self._done, self.due = 0, spec.learner.next_fit(0)
 
-    @property
-    def samples(self) -> int:
-        """Number of samples taken."""
-        return int(self._trial.network.process.n_samples[0])
-
     def request(self) -> Request:
         """Return what the next fit needs: a copy, and the samples go on."""
-        network, state, n = self._trial.network, self._trial.state, self.samples
+        network, state = self._trial.network, self._trial.state
+        n = int(network.process.n_samples[0])
         p = network.sizes[0]
         chosen = evenly(n, MOST_FITTED)
         phi = state.theta[: p * network.process.room].reshape(p, -1)[:, chosen]
@@ -71,22 +67,21 @@ class Evidence:
         return Request(phi, targets, state.posterior.counts[chosen], starts, self._noise)
 
     def take(self, numbers: Array, samples: int) -> None:
-        """Let the numbers of a fit to so many samples come into force."""
-        network, theta, posterior = (
-            self._trial.network,
-            self._trial.state.theta,
-            self._trial.state.posterior,
-        )
+        """Let the numbers of a fit after so many steps come into force."""
+        self._call(thin)
         self.numbers[:] = numbers
-        kinds = tuple(map(kind_of, (network, theta, posterior)))
-        code: Any = compiled_for("refactor", refactor, kinds)
-        code(network, theta, posterior)
+        self._call(refactor)
         self._done += 1
         self.due = self._learner.next_fit(samples)
 
+    def _call(self, function: CompiledFunction) -> None:
+        network, state = self._trial.network, self._trial.state
+        given = network, state.theta, state.posterior
+        compiled_for(path_of(function), function, tuple(map(kind_of, given)))(*given)
+
     def fit(self, points: Evaluation) -> float:
-        """Fit the kernels to all samples, and return the time that it took [µs]."""
+        """Fit the kernels, with as many samples as were due; return the time that it took [µs]."""
         begun = time.perf_counter()
-        self.take(fit_rows(self.request()), self.samples)
+        self.take(fit_rows(self.request()), self.due)
         points.n_basis[0] = 0
         return 1e6 * (time.perf_counter() - begun)

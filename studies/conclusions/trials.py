@@ -86,8 +86,8 @@ BEST: dict[str, dict[str, Any]] = {
 """Plans many steps ahead, chosen on seeds 1000 to 1005."""
 
 
-def cells(env: str = "", plant: str = "") -> Iterator[Cell]:
-    """Yield the cells, those of an environment or a plant where one is named."""
+def cells() -> Iterator[Cell]:
+    """Yield all cells."""
     for name in SYSTEMS:
         policies = ["d_optimal", "random", "uniform"]
         policies += ["periodic"] if name != "quadrotor" else []
