@@ -233,7 +233,7 @@ def fit_offline(
     elif spec.model.structure == "least_squares":
         parameters, steps, converged = _solve(spec, x, u, y, initial, ridge), 1, True
     elif isinstance(spec.model, GaussianProcess):
-        from dopt.evidence import fit_process
+        from dopt.kernel.evidence import fit_process
 
         parameters = fit_process(spec.model, spec.system, x, y, spec.seed)
         steps, converged = 1, True

@@ -10,9 +10,9 @@ import sys
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.evidence import Request, fit_rows
 from dopt.explorer.refit import Found
 from dopt.fitting.fit import fit
+from dopt.kernel.evidence import Request, fit_rows
 from dopt.log import Log
 from dopt.systems.plant import Plant
 from dopt.types import Array

@@ -16,17 +16,22 @@ import sys
 import threading
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.evidence import Request
 from dopt.explorer.journal import Event
 from dopt.log import Log, Piece
 from dopt.spec.scaled import Scaled
 from dopt.systems.plant import Plant, unknown
 from dopt.types import Array
+
+if TYPE_CHECKING:
+    from dopt.kernel.evidence import Request  # which loads the compiler
+
+    FitRequest = tuple[Plant, Log, int, int] | Request
+    """What a fit is given: plant, log, units of the network, seed; or samples of processes."""
 
 
 class Recording:
@@ -127,6 +132,8 @@ class Found(NamedTuple):
 
 def first_evidence() -> Request:
     """Return a small fit of the evidence."""
+    from dopt.kernel.evidence import Request
+
     y = np.sin(np.arange(4.0))
     return Request(y[None], y[None], np.ones(4), np.ones((1, 1, 5)), None)
 
@@ -150,10 +157,6 @@ def first_simulation() -> tuple[Plant, Log, int, int]:
     )
     pieces = [Piece(0.1 * np.arange(150.0), x[:, None], u[:, None])]
     return plant, Log.of_pieces(["x"], ["u"], pieces), 1, 0
-
-
-FitRequest = tuple[Plant, Log, int, int] | Request
-"""What a fit is given: plant, log, units of the network and seed; or samples of processes."""
 
 
 class FitBeside:

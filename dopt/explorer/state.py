@@ -35,7 +35,7 @@ import numpy as np
 from dopt.errors import ExplorationError
 from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
-from dopt.explorer.refit import FitRequest, Found, Recording
+from dopt.explorer.refit import Found, Recording
 from dopt.explorer.signs import Signs
 from dopt.learning import Conditioning, SimulationError
 from dopt.models import MLP
@@ -47,7 +47,8 @@ from dopt.systems.plant import ExploredPlant
 from dopt.types import Array
 
 if TYPE_CHECKING:
-    from dopt.kernel.refit import Evidence  # which loads the compiler
+    from dopt.explorer.refit import FitRequest
+    from dopt.kernel.evidence import Evidence  # which loads the compiler
 
 # A planner that is waited for until a deadline.
 

@@ -12,7 +12,7 @@ from dopt.kernel import information
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation import BLOCK
-from dopt.kernel.refit import Evidence, is_tuned
+from dopt.kernel.evidence import Evidence, is_tuned
 from dopt.kernel.state_from_spec import (
     empty_record,
     empty_scratch,

@@ -364,7 +364,8 @@ def negative_evidence(
     _write_covariance(numbers, phi, counts, E, K)
     if not factorize(K):
         return np.inf
-    alpha, value = y.copy(), 0.5 * n * np.log(2.0 * np.pi)
+    alpha = y.copy()
+    value: float = 0.5 * n * np.log(2.0 * np.pi)
     for i in range(n):
         value += np.log(K[i, i])
     solve_lower(K, n, alpha.reshape(1, n))
@@ -446,7 +447,8 @@ def information(numbers: Matrix, features: Matrix, rows: Matrix, a: int, b: int)
     if k != b % numbers.shape[0]:
         return 0.0
     value = posterior_covariance(numbers[k], features[a], features[b], rows[a], rows[b])
-    return max(value, 0.0 if a == b else -np.inf) / numbers[k, numbers.shape[1] - 1]
+    share: float = max(value, 0.0 if a == b else -np.inf) / numbers[k, numbers.shape[1] - 1]
+    return share
 
 
 @compiled
@@ -454,7 +456,8 @@ def posterior_covariance(
     numbers: Vector, a: Vector, b: Vector, of_a: Vector, of_b: Vector
 ) -> float:
     """Return the covariance of a row at features (p,), given L⁻¹k, (n,), of both."""
-    p, square, value = a.shape[0], 0.0, numbers[2 * a.shape[0] + 1]
+    p, square = a.shape[0], 0.0
+    value: float = numbers[2 * p + 1]
     for j in range(p):
         square += numbers[j] * (a[j] - b[j]) * (a[j] - b[j])
         value += numbers[p + 1 + j] * a[j] * b[j]

@@ -29,8 +29,9 @@ class GaussianProcess(Model):
         k(x, x') = s² exp(-½ Σ_j w_j (φ_j - φ'_j)²) + Σ_j l_j φ_j φ'_j + c
 
     with numbers of its own, which maximise the probability of the samples (the marginal likelihood)
-    beside a weak prior (:mod:`dopt.evidence`). References: C. Rasmussen and C. Williams, "Gaussian
-    processes for machine learning", chapters 2 and 5 (2006); for exploration, the paper's [8].
+    beside a weak prior (:mod:`dopt.kernel.evidence`). References: C. Rasmussen and C. Williams,
+    "Gaussian processes for machine learning", chapters 2 and 5 (2006); for exploration, the
+    paper's [8].
 
     The flat parameter vector holds the features of the samples, (p, C), with room for C of them,
     and α, (r, C); places of samples not yet taken are zero and add nothing. With "evidence" the

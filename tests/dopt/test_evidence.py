@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from dopt import Explorer
 from dopt.errors import IncompatibleError
-from dopt.evidence import Request, evenly, fit_numbers, fit_rows, guessed
+from dopt.kernel.evidence import Request, evenly, fit_numbers, fit_rows, guessed
 from dopt.kernel.gaussian_process import negative_evidence
 from dopt.kernel.run import trial_in_kernel
 from dopt.models import gaussian_process
