@@ -87,7 +87,7 @@ def fit_numbers(
         return value + 0.5 * float(apart @ apart), slope[free] + apart / spread[free]
 
     def completed(eta: Array) -> Array:
-        numbers = np.exp(np.concatenate([eta, guess[len(free) :]]))
+        numbers: Array = np.exp(np.concatenate([eta, guess[len(free) :]]))
         least = ROUNDING * (numbers[p] + numbers[p + 1 : 2 * p + 2].sum())
         numbers[-1] = max(numbers[-1] if noise is None else noise, least)
         return numbers
@@ -105,8 +105,8 @@ def fit_numbers(
         )
         for start in starts
     ]
-    best: Array = min(found, key=lambda one: one.fun).x
-    return completed(best)
+    numbers: Array = completed(min(found, key=lambda one: one.fun).x)
+    return numbers
 
 
 class Request(NamedTuple):
