@@ -45,7 +45,9 @@ def complete(path: Path) -> None:
         writer = csv.writer(file, lineterminator="\n")
         if new:
             writer.writerow((*Cell._fields, "seed", *Row._fields))
-        for (cell, seed), measured in zip(wanted, pool.map(row, *zip(*wanted, strict=True))):
+        for (cell, seed), measured in zip(
+            wanted, pool.map(row, *zip(*wanted, strict=True)), strict=True
+        ):
             writer.writerow((*cell, seed, *(f"{value:.4g}" for value in measured)))
             file.flush()
 
