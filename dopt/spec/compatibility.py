@@ -348,6 +348,22 @@ def _models(structure: str) -> str:
     return _choice("model", [name for name, one in MODELS.items() if one.structure == structure])
 
 
+def check_sampled(system: System, model: Model) -> None:
+    """Raise IncompatibleError if the record of a trial gives no samples of a model of the states.
+
+    Its learned part may depend on the inputs, its learner may have known other states than it
+    records, or the record may not say where it restarted.
+    """
+    what = "assess.sample_loss"
+    if model.n_inputs_read(system) or system.reads_inputs:
+        given = f"model '{model.name}', which reads inputs,"
+        raise mismatch(what, "a model of the states alone", given)
+    if system.n_measured:
+        raise mismatch(what, "states that are known", "states that are measured with noise", "were")
+    if getattr(system, "restarts", False):
+        raise mismatch(what, "trials in one piece", "env.restarts true")
+
+
 def mismatch(what: str, expected: str, given: str, verb: str = "was") -> IncompatibleError:
     """Return the error for two choices that do not go together."""
     return IncompatibleError(
