@@ -265,7 +265,7 @@ assessment = _table(
 )
 
 SAMPLE_LOSS = "sample_loss"
-"""Measure of the table ``assessment`` that may be stored of some trials of a configuration alone."""
+"""Measure of the table ``assessment`` that some trials of a configuration may have alone."""
 
 attempt = _table(
     "attempt",
