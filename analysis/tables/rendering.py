@@ -188,6 +188,8 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
         f"Diverged trials: {rule}."
     )
+    if "sample_loss" in table:
+        note += " Sample loss: mean over the trials of which one is stored (analysis sample-loss)."
     return rendered(table, columns, note)
 
 

@@ -65,7 +65,8 @@ def measure_sample_losses(
         known = sample_losses(reader, entry)
         fitted, left = _fitted(reader, entry, known)
         for why, count in left.items():
-            say(f"{entry.config.env}, {entry.label}: {count} trials left out: {why}")
+            trials = "1 trial" if count == 1 else f"{count} trials"
+            say(f"{entry.config.env}, {entry.label}: {trials} left out: {why}")
         steps = {trial.seed: (trial.trial_key, trial.n_steps or 0) for trial in entry.trials}
         keep(
             {
@@ -87,7 +88,7 @@ def _fitted(
     reader: Reader, entry: Entry, known: Mapping[int, float]
 ) -> tuple[dict[int, float], Counter[str]]:
     """Return the sample losses that are not known, by seed; and how many are left out, and why."""
-    left = Counter("they diverged" for trial in entry.trials if trial.status == "diverged")
+    left = Counter("diverged" for trial in entry.trials if trial.status == "diverged")
     seeds = [seed for seed in entry.final_losses() if seed not in known]
     try:
         spec = simulated_trial(entry.config, 0)
@@ -98,10 +99,11 @@ def _fitted(
     for seed in seeds:
         try:
             stored = reader.trajectory(entry.config.config_key, seed)
+            fitted[seed] = sample_loss(spec.with_seed(seed), stored.states, stored.inputs)
         except QueryError:
             left["their states and inputs are not stored"] += 1
-        else:
-            fitted[seed] = sample_loss(spec.with_seed(seed), stored.states, stored.inputs)
+        except SpecificationError as error:
+            left[str(error)] += 1
     return fitted, left
 
 
