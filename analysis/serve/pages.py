@@ -162,7 +162,7 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
     finals = state.selections.get_or_compute(
         ("final", reader, progress["token"]), lambda: _by_config(reader, _FINAL)
     )
-    samples = _by_config(reader, _SAMPLED)
+    losses = finals, _by_config(reader, _SAMPLED)
     policies, absent = _policies(configs), absent_pairs(configs)
     return {
         "progress": progress,
@@ -170,9 +170,7 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
         "environments": [
             {
                 "env": env,
-                "rows": _rows(
-                    [one for one in configs if one.env == env], policies, absent, finals, samples
-                ),
+                "rows": _rows([c for c in configs if c.env == env], policies, absent, losses),
             }
             for env in _environments(configs)
         ],
@@ -193,14 +191,13 @@ def _rows(
     configs: Sequence[ConfigRow],
     policies: Sequence[str],
     absent: Sequence[tuple[str, str]],
-    finals: Mapping[str, Array],
-    samples: Mapping[str, Array],
+    losses: Sequence[Mapping[str, Array]],
 ) -> list[Content]:
     """Return a row for each width of an environment, with a cell for each policy."""
     widths = _widths(configs)
     only = widths[0] if len(widths) == 1 else None
     tiles = [
-        _tile(config, *(one.get(config.config_key, np.empty(0)) for one in (finals, samples)))
+        _tile(config, *(one.get(config.config_key, np.empty(0)) for one in losses))
         for config in configs
     ]
     for kind in (False, True):  # prequential losses have another scale

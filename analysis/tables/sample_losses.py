@@ -14,7 +14,7 @@ from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError
 from analysis.stats.control import geometric_mean
 from analysis.style import within
-from analysis.tables.rendering import Columns, TableKind, Text, TextTable, rendered
+from analysis.tables.rendering import Columns, TableKind, Text, rendered
 from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError
 from dopt.offline_fit import sample_loss
@@ -32,20 +32,9 @@ NOTE = (
 )
 
 _MEANS = {"loss": "final loss", "sample_loss": "sample loss", "ratio": "final / sample"}
-"""Columns of geometric means with their headings."""
 
 Keep = Callable[[Mapping[str, Assessment]], object]
 """Stores fitted sample losses by trial key."""
-
-
-def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
-    """Return the table; ``say`` is told what is left out, and ``keep`` gets what was fitted."""
-    return TableKind(
-        "Final losses beside sample losses",
-        lambda selection, *_: selection,
-        lambda reader, selection, _: measure_sample_losses(reader, selection, say, keep),
-        lambda table, _: sample_loss_table(table),
-    )
 
 
 def measure_sample_losses(
@@ -65,15 +54,9 @@ def measure_sample_losses(
         known = sample_losses(reader, entry)
         fitted, left = _fitted(reader, entry, known)
         for why, count in left.items():
-            trials = "1 trial" if count == 1 else f"{count} trials"
-            say(f"{entry.config.env}, {entry.label}: {trials} left out: {why}")
-        steps = {trial.seed: (trial.trial_key, trial.n_steps or 0) for trial in entry.trials}
-        keep(
-            {
-                steps[seed][0]: Assessment(steps[seed][1], SAMPLE_LOSS, loss)
-                for seed, loss in fitted.items()
-            }
-        )
+            say(f"{entry.config.env}, {entry.label}, trials left out: {count}, {why}")
+        new = [(trial, fitted[trial.seed]) for trial in entry.trials if trial.seed in fitted]
+        keep({one.trial_key: Assessment(one.n_steps or 0, SAMPLE_LOSS, loss) for one, loss in new})
         if known or fitted:
             rows.append(_row(entry, {**known, **fitted}))
     if not rows:
@@ -118,15 +101,20 @@ def _row(entry: Entry, samples: Mapping[int, float]) -> dict[str, object]:
     return row | {"n": len(samples)}
 
 
-def sample_loss_table(table: pd.DataFrame) -> TextTable:
-    """Return the table for people."""
+def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
+    """Return the table; ``say`` is told what is left out, and ``keep`` gets what was fitted."""
     columns: Columns = (
         ("env", itemgetter("env")),
         ("variant", itemgetter("label")),
         *((f"{title} [95 %]", _mean_text(name)) for name, title in _MEANS.items()),
         ("n", itemgetter("n")),
     )
-    return rendered(table, columns, NOTE)
+    return TableKind(
+        "Final losses beside sample losses",
+        lambda selection, *_: selection,
+        lambda reader, selection, _: measure_sample_losses(reader, selection, say, keep),
+        lambda table, _: rendered(table, columns, NOTE),
+    )
 
 
 def _mean_text(name: str) -> Text:

@@ -349,15 +349,10 @@ def _models(structure: str) -> str:
 
 
 def check_sampled(system: System, model: Model) -> None:
-    """Raise IncompatibleError if the record of a trial gives no samples of a model of the states.
-
-    Its learned part may depend on the inputs, its learner may have known other states than it
-    records, or the record may not say where it restarted.
-    """
-    what = "assess.sample_loss"
+    """Raise IncompatibleError if the record of a trial gives no samples of a model of the states."""
+    what, reading = "assess.sample_loss", f"model '{model.name}', which reads inputs,"
     if model.n_inputs_read(system) or system.reads_inputs:
-        given = f"model '{model.name}', which reads inputs,"
-        raise mismatch(what, "a model of the states alone", given)
+        raise mismatch(what, "a model of the states alone", reading)
     if system.n_measured:
         raise mismatch(what, "states that are known", "states that are measured with noise", "were")
     if getattr(system, "restarts", False):

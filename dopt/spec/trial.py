@@ -265,18 +265,14 @@ def _model(section: Part) -> Model:
 
 def _assesses_samples(section: object) -> bool:
     """Return whether a section ``assess`` asks for the sample loss."""
-    given = {} if section is None else section
-    if not isinstance(given, Mapping) or given.keys() - {"sample_loss"}:
-        raise SpecificationError(
-            f"configuration key 'assess' is {section!r}, but a section with the field sample_loss "
-            f"is expected: write for instance assess.sample_loss=true."
-        )
-    flag = given.get("sample_loss", False)
-    if not isinstance(flag, bool):
-        raise SpecificationError(
-            f"assess.sample_loss is {flag!r}, but true or false is expected: set it to one of them."
-        )
-    return flag
+    if section in (None, {}, {"sample_loss": False}):
+        return False
+    if section == {"sample_loss": True}:
+        return True
+    raise SpecificationError(
+        f"configuration key 'assess' is {section!r}, but a section with sample_loss, true or "
+        f"false, is expected: write for instance assess.sample_loss=true."
+    )
 
 
 def _shown(value: object) -> str:

@@ -83,8 +83,8 @@ def test_rows_are_geometric_means_over_the_trials(
             shown = row[[name, f"{name}_low", f"{name}_high"]].to_numpy(float)
             np.testing.assert_allclose(np.log(shown), [np.mean(own), low, high], atol=1e-6)
         assert row.n == 3
-    assert "pendulum, random: 1 trial left out: diverged" in notes
-    assert "3 trials left out: assess.sample_loss goes with a model of the states alone" in notes
+    assert "pendulum, random, trials left out: 1, diverged" in notes
+    assert "trials left out: 3, assess.sample_loss goes with a model of the states alone" in notes
 
 
 def test_trials_without_stored_states_are_named(
@@ -93,7 +93,7 @@ def test_trials_without_stored_states_are_named(
     with sqlite3.connect(url.removeprefix("sqlite:///")) as database:
         database.execute("DELETE FROM trajectory WHERE trial_id <= 2")
     output, notes = run(capsys, "sample-loss", "--db", url, "--env", "pendulum")
-    assert "2 trials left out: their states and inputs are not stored" in notes
+    assert "trials left out: 2, their states and inputs are not stored" in notes
     assert "D-optimal" in output
 
 

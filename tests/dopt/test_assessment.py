@@ -346,6 +346,6 @@ def test_a_trial_without_samples_of_a_model_of_the_states_is_refused() -> None:
             sampled("pendulum", "random", **sections)
     with pytest.raises(IncompatibleError, match="which reads inputs"):
         sampled("pendulum_unknown_gain", "random")
-    for given in ({"sample_loss": 1}, {"sample_los": True}, True):
+    for given in ({"sample_loss": "on"}, {"sample_los": True}, True):
         with pytest.raises(SpecificationError, match="sample_loss"):
             TrialSpec.from_mapping(trial("pendulum", "random").to_mapping() | {"assess": given})

@@ -232,7 +232,7 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.memory_gib=0", "launch.memory_gib is 0, but null or a number of GiB above 0"),
         ("launch.retry_memory=2", "launch.retry_memory is 2, but there is no limit that it could"),
         ("launch.lease=null", "launch.lease"),
-        ("assess.sample_loss=1", "assess.sample_loss is 1, but true or false is expected"),
+        ("assess.sample_loss=yes please", "'assess' is {'sample_loss': 'yes please'}, but"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
         ("launch.patience=60", "launch.patience is 60, but less than launch.lease=60 is expected"),
     ],
