@@ -122,6 +122,30 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
     return Samples(at, inputs, observed[:, list(system.learned_rows)])
 
 
+def sample_loss(spec: TrialSpec, states: Array, inputs: Array) -> float:
+    """Return how much of the system the samples of a trial tell, whatever its own learner was.
+
+    A Gaussian process is fitted to them, with the kernel that maximises its evidence. Its loss is
+    the root mean square error over the evaluation grid at the last step, as of the trial itself.
+
+    Parameters
+    ----------
+    spec : TrialSpec
+        The trial; its policy, model and learner make no difference.
+    states, inputs : (T + 1, d), (T, m)
+        Of the trial.
+
+    Raises
+    ------
+    SpecificationError
+        If the trial diverged, or does not record the samples of a model of the states: its model
+        reads inputs, its states are measured with noise, or it may have restarted.
+    """
+    process = TrialSpec(spec.config.process, spec.seed)
+    samples = recorded_samples(spec.system, states, inputs)
+    return fit_offline(process, samples.states, samples.accelerations).loss
+
+
 RIDGE = 1e-4
 """Weight ρ of ‖θ - θ₀‖² beside the sum of squares.
 

@@ -146,7 +146,7 @@ def fit_process(
     """Return the parameters of a process, (q,), fitted to samples: its kernels and its mean.
 
     A fit of the evidence starts from a guess and from random numbers, on an even choice of the
-    samples, and goes on with all of them. Of more samples than there is room for the process takes
+    samples, and goes on with more of them. Of more samples than there is room for the process takes
     an even choice.
 
     Parameters
@@ -165,7 +165,7 @@ def fit_process(
     parameters = model.initial_parameters(system, rng)
     parameters[: p * C].reshape(p, C)[:, :n] = phi
     known = model.known_noise(system)
-    few = evenly(n, FEW)
+    few, many = evenly(n, FEW), evenly(n, MANY)
     for k, y in enumerate(targets):
         numbers = model.fixed_numbers(system)
         if model.is_tuned:
@@ -173,7 +173,8 @@ def fit_process(
             starts = [guess, guess * np.exp(rng.standard_normal(len(guess)))]
             numbers = fit_numbers(phi[:, few], y[few], np.ones(len(few)), starts, known, 2 * MOST)
             if len(few) < n:
-                numbers = fit_numbers(phi, y, np.ones(n), [numbers], known, MOST)
+                ones = np.ones(len(many))
+                numbers = fit_numbers(phi[:, many], y[many], ones, [numbers], known, MOST)
             parameters[(p + r) * C :].reshape(r, -1)[k] = numbers
         K = kernel(numbers, phi.T, phi.T) + numbers[-1] * np.eye(n)
         parameters[(p + k) * C : (p + k) * C + n] = cho_solve(cho_factor(K), y)
@@ -182,6 +183,9 @@ def fit_process(
 
 FEW = 150
 """Samples of the first part of a fit."""
+
+MANY = 500
+"""Samples of its second part: its time grows with their cube."""
 
 MOST = 20
 """Iterations of its second part."""

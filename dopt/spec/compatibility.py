@@ -348,6 +348,17 @@ def _models(structure: str) -> str:
     return _choice("model", [name for name, one in MODELS.items() if one.structure == structure])
 
 
+def check_sampled(system: System, model: Model) -> None:
+    """Raise IncompatibleError if the record of a trial gives no samples of a model of the states."""
+    what, reading = "assess.sample_loss", f"model '{model.name}', which reads inputs,"
+    if model.n_inputs_read(system) or system.reads_inputs:
+        raise mismatch(what, "a model of the states alone", reading)
+    if system.n_measured:
+        raise mismatch(what, "states that are known", "states that are measured with noise", "were")
+    if getattr(system, "restarts", False):
+        raise mismatch(what, "trials in one piece", "env.restarts true")
+
+
 def mismatch(what: str, expected: str, given: str, verb: str = "was") -> IncompatibleError:
     """Return the error for two choices that do not go together."""
     return IncompatibleError(
