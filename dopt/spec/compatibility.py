@@ -349,7 +349,7 @@ def _models(structure: str) -> str:
 
 
 def check_sampled(system: System, model: Model) -> None:
-    """Raise IncompatibleError if the record of a trial gives no samples of a model of the states."""
+    """Raise IncompatibleError if the record of a trial gives no samples of a state model."""
     what, reading = "assess.sample_loss", f"model '{model.name}', which reads inputs,"
     if model.n_inputs_read(system) or system.reads_inputs:
         raise mismatch(what, "a model of the states alone", reading)

@@ -105,8 +105,13 @@ def cells() -> list[list[Cell]]:
         for one in policies["pendulum"]
         for name in LEARNERS
     ]
-    slow = [cell for cell in ideal if cell.learner == "gauss_newton"]
-    return [first, [cell for cell in ideal if cell not in slow], hardware, slow]
+    groups = [first]
+    for slow in (False, True):
+        groups += [
+            [one for one in part if (one.learner == "gauss_newton") == slow]
+            for part in (ideal, hardware)
+        ]
+    return groups
 
 
 class Row(NamedTuple):
@@ -178,7 +183,7 @@ def _extent(system: System, states: Array) -> tuple[float, float]:
     """Return width and gap of states, (T + 1, d); angles are taken on the circle."""
     visited, box = (_in_half_widths(system, one) for one in (states, box_states(system)))
     distances, _ = cKDTree(visited).query(box)
-    return float(np.sqrt(np.mean(visited**2))), float(distances.mean())
+    return float(np.sqrt(np.mean(visited**2))), float(np.mean(distances))
 
 
 def _in_half_widths(system: System, states: Array) -> Array:
