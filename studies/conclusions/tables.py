@@ -49,8 +49,8 @@ def ratio_text(these: pd.Series[float], others: pd.Series[float]) -> str:
 
 
 def markdown(head: list[str], body: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *body]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    lines = [f"| {' | '.join(line)} |\n" for line in (head, *body)]
+    return "".join([lines[0], f"|{'---|' * len(head)}\n", *lines[1:]])
 
 
 def conclusions_rivals(rows: pd.DataFrame | None = None) -> str:
