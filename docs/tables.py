@@ -30,8 +30,9 @@ from studies.conclusions import tables as conclusions
 
 DOCS = Path(__file__).parent
 PAGES = (
-    "compiled_plugins.md", "conclusions.md", "database.md", "figures.md", "findings.md", "method.md",
-    "options.md", "plants.md", "structure.md", "tutorial.md", "wide_networks.md", "yardsticks.md", "../README.md",
+    "compiled_plugins.md", "conclusions.md", "database.md", "figures.md", "findings.md",
+    "method.md", "options.md", "plants.md", "structure.md", "tutorial.md", "wide_networks.md",
+    "yardsticks.md", "../README.md",
 )  # fmt: skip
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from analysis.stats.intervals import geometric_mean
+from analysis.stats.intervals import Estimate, geometric_mean
 from analysis.style import number, within
 from studies.conclusions.trials import BEST, LEARNERS, PLANTS, SYSTEMS
 
@@ -28,17 +29,23 @@ def read(path: Path = ROWS) -> pd.DataFrame:
 
 def losses(rows: pd.DataFrame, *cell: str, column: str = "loss") -> pd.Series[float]:
     """Return a column of one cell by seed; empty where there are too few trials."""
-    if cell not in rows.index.droplevel("seed"):
+    given: Any = rows  # the stubs of pandas know no index of four levels
+    if cell not in given.index.droplevel("seed"):
         return pd.Series(dtype=float)
-    found = rows.loc[cell, column].dropna()
+    found: pd.Series[float] = given.loc[cell, column].dropna()
     return found if len(found) >= FEWEST else found.iloc[:0]
+
+
+def middle(values: pd.Series[float]) -> Estimate:
+    """Return the geometric mean of a column."""
+    return geometric_mean(values.to_numpy(float))
 
 
 def mean_text(values: pd.Series[float]) -> str:
     """Return a geometric mean with its interval."""
     if not len(values):
         return "–"
-    found = geometric_mean(values.to_numpy())
+    found = middle(values)
     return within(found.value, found.low, found.high)
 
 
@@ -76,7 +83,7 @@ def conclusions_samples(rows: pd.DataFrame | None = None) -> str:
         for env in SYSTEMS:
             cell = env, "ideal", policy, "adam_window"
             pair = losses(rows, *cell), losses(rows, *cell, column="sample_loss")
-            means = [number(geometric_mean(one.to_numpy()).value) for one in pair if len(one)]
+            means = [number(middle(one).value) for one in pair if len(one)]
             cells.append(" / ".join(means) or "–")
         body.append([title, *cells])
     return markdown(["inputs", *SYSTEMS], body)

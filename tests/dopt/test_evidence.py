@@ -144,8 +144,8 @@ def test_an_offline_fit_reads_the_samples() -> None:
     states = rng.uniform(-1, 1, (120, 2)) * [np.pi, 2.0]
     truth = spec.system.learned(states, 0)
     fit = fit_offline(spec, states, truth + 0.01 * rng.standard_normal(truth.shape))
+    assert isinstance(spec.model, GaussianProcess)
     fixed = dataclasses.replace(spec.model, hyperparameters="fixed")
-    assert isinstance(fixed, GaussianProcess)
     other = TrialSpec(dataclasses.replace(spec.config, model=fixed), spec.seed)
     assert fit.loss < 0.3 * fit_offline(other, states, truth).loss
     assert fit.residual < 0.02

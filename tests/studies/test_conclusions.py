@@ -10,6 +10,7 @@ import pytest
 
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from dopt.systems.properties import eigenmode
 from studies.conclusions import tables, trials
 from studies.conclusions.__main__ import complete, main
 from studies.conclusions.trials import Cell, Row
@@ -76,7 +77,7 @@ def test_the_extent_of_states() -> None:
 def test_the_power_near_the_eigenfrequency() -> None:
     system = SYSTEMS["pendulum"]()
     time = system.dt * np.arange(500)[:, None]
-    mode = trials.eigenmode(system)
+    mode = eigenmode(system)
     assert mode is not None
     assert trials._resonant(system, np.sin(mode.frequency * time)) > 0.9
     assert trials._resonant(system, np.sin(3.0 * mode.frequency * time)) < 0.05
