@@ -38,7 +38,7 @@ def losses(rows: pd.DataFrame, *cell: str, column: str = "loss") -> pd.Series[fl
 
 def middle(values: pd.Series[float]) -> Estimate:
     """Return the geometric mean of a column."""
-    return geometric_mean(values.to_numpy(float))
+    return geometric_mean(np.asarray(values, dtype=float))
 
 
 def mean_text(values: pd.Series[float]) -> str:
@@ -92,14 +92,14 @@ def conclusions_samples(rows: pd.DataFrame | None = None) -> str:
 def conclusions_best(rows: pd.DataFrame | None = None) -> str:
     """Lowest losses with the evidence model, and what a step costs."""
     rows = read() if rows is None else rows
-    found = {env: rows.loc[env, "ideal", "best", "evidence"] for env in BEST}
+    near, far = (
+        [losses(rows, env, "ideal", policy, "evidence") for env in BEST]
+        for policy in ("d_optimal", "best")
+    )
     body = [
-        ["loss", *(mean_text(one.loss) for one in found.values())],
-        ["worst seed", *(number(one.loss.max()) for one in found.values())],
-        [
-            "one step ahead",
-            *(mean_text(losses(rows, env, "ideal", "d_optimal", "evidence")) for env in BEST),
-        ],
+        ["loss", *map(mean_text, far)],
+        ["worst seed", *(number(one.max()) for one in far)],
+        ["one step ahead", *map(mean_text, near)],
     ]
     return markdown(["", *BEST], body)
 
