@@ -10,7 +10,7 @@ import argparse
 import os
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -28,18 +28,21 @@ from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread
 from analysis.stats.intervals import BandKind, Statistic
 from analysis.stats.scores import Measure
+from analysis.tables import sample_losses
 from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
     TABLES,
+    TableKind,
     TextTable,
     comparison,
     incomplete,
 )
 from dopt.errors import install_command
 from dopt.process import usable_cores
+from dopt.result import Assessment
 from orchestrate.program import Parser, UsageError, answered, path, positive, tell
-from orchestrate.store import DEFAULT_URL, Reader, default_url
+from orchestrate.store import DEFAULT_URL, Reader, Store, default_url
 
 COLUMNS = ("loss", "reachable_loss")
 FORMATS = ("markdown", "latex", "csv")
@@ -104,11 +107,14 @@ def parser() -> Parser:
         commands, "aggregate", _table, "every variant against the reference, over all systems"
     )
     calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP, diverged=False)
+    sampled = _command(commands, "sample-loss", _table, sample_losses.HELP, diverged=False)
+    sampled.add_argument("--store", action="store_true", help="keep what is fitted in the database")
     tables = {
         summary: lambda _: TABLES["summary"],
         compare: lambda options: comparison(options.column, Measure(options.measure)),
         aggregate: lambda _: TABLES["aggregate"],
         calibrated: lambda _: CALIBRATION,
+        sampled: _sampled,
     }
     for table, kind in tables.items():
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
@@ -125,7 +131,7 @@ def parser() -> Parser:
             metavar="POLICY",
             help=f"what all others are compared with ({REFERENCE}); with --group-by a value",
         )
-    for command in (figures, summary, compare, aggregate, calibrated):
+    for command in (figures, summary, compare, aggregate, calibrated, sampled):
         command.add_argument(
             "--group-by",
             nargs="+",
@@ -291,6 +297,17 @@ def _table(reader: Reader, selection: Selection, options: argparse.Namespace) ->
         tell(sys.stderr, f"{partial_warning(selection)}\n")
     tell(sys.stdout, _text(kind.render(table, plot_options), table, form), exact=form == "csv")
     return 0
+
+
+def _sampled(options: argparse.Namespace) -> TableKind:
+    """Return the table of sample losses, which stores them where it was asked to."""
+
+    def keep(fitted: Mapping[str, Assessment]) -> None:
+        if options.store and fitted:
+            with Store.open(options.db) as store:
+                store.add_assessments(fitted)
+
+    return sample_losses.sample_loss_kind(lambda text: tell(sys.stderr, f"note: {text}\n"), keep)
 
 
 def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:

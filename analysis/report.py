@@ -36,6 +36,7 @@ from analysis.tables.rendering import (
     ratio_text,
     records,
     rendered,
+    sample_loss_columns,
     text_of,
 )
 from analysis.tables.variants import (
@@ -108,6 +109,9 @@ EXPLAINED = (
     "of an implementation that nobody made fast.",
     "Same setting: the ratio to the reference policy with the variant's own model and learner, its "
     "adjusted p beside it; – where that is the reference itself or was not run.",
+    "Sample loss, where it is stored: of a Gaussian process tuned by its evidence and fitted to "
+    "the samples of each trial, mean ± 2 standard errors: what a policy collected, whatever its "
+    "learner made of it.",
     "n: trials that did not diverge; by default diverged ones are in no mean and in no ratio.",
 )
 
@@ -261,7 +265,8 @@ def _section(env: str, rows: Sequence[Row], picture: str | None) -> str:
     parts = [f"## {title}", facts]
     if picture is not None:
         parts.append(f"![Ratios of final losses: {title}]({picture}.png)")
-    parts += [rendered(rows, columns).markdown() for columns in (LOSSES, EFFORT)]
+    losses = (*LOSSES, *sample_loss_columns("sample_loss" in rows[0]))
+    parts += [rendered(rows, columns).markdown() for columns in (losses, EFFORT)]
     return "\n\n".join(parts)
 
 

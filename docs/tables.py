@@ -26,11 +26,13 @@ from code_tables import markdown
 from analysis.stats.intervals import band, standard_error
 from analysis.stats.scores import compare
 from analysis.style import number, plus_minus, share, within
+from studies.conclusions import tables as conclusions
 
 DOCS = Path(__file__).parent
 PAGES = (
-    "compiled_plugins.md", "database.md", "figures.md", "findings.md", "method.md", "options.md",
-    "plants.md", "structure.md", "tutorial.md", "wide_networks.md", "yardsticks.md", "../README.md",
+    "compiled_plugins.md", "conclusions.md", "database.md", "figures.md", "findings.md",
+    "method.md", "options.md", "plants.md", "structure.md", "tutorial.md", "wide_networks.md",
+    "yardsticks.md", "../README.md",
 )  # fmt: skip
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")
@@ -502,6 +504,7 @@ TABLES: dict[str, Callable[[], str]] = {
     )
 }  # fmt: skip
 TABLES |= code_tables.TABLES
+TABLES |= {made.__name__: made for made in conclusions.TABLES}
 
 
 def with_tables(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Assessment of a trial: control, free-run error, coverage, parameters, violated limits."""
+"""Assessment of a trial: control, free runs, coverage, parameters, violated limits, samples."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.limits import VIOLATIONS, WORST
 from dopt.models import MLP, Linear, Model
+from dopt.offline_fit import sample_loss
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
@@ -220,6 +221,8 @@ def loss_by_parameter_error(system: System) -> float:
 KEPT_OUTCOMES = 4096
 """Outcomes that trials of one seed share and that are kept: the true and the untrained model's."""
 
+SAMPLE_LOSS = "sample_loss"
+
 MEASURES = {
     "control_success": "1 if the episode that the learned model plans succeeds, otherwise 0",
     "control_cost": "its cost",
@@ -231,6 +234,7 @@ MEASURES = {
     "coverage": "share of the phase plane's box that the states up to t have visited",
     VIOLATIONS: "number of states up to t that are beyond a bound of the limits",
     WORST: "farthest distance beyond a bound up to t, in the unit of the state; 0 within bounds",
+    SAMPLE_LOSS: "loss of a Gaussian process tuned by its evidence on the trial's own samples",
 }
 """Every measure with its meaning; t is the number of steps explored, 0 the untrained model."""
 
@@ -330,6 +334,9 @@ def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:
         reached = result.states[1:]
         finite = np.isfinite(reached).all(axis=1)
         rows += violations(spec.limits.excess(spec.system, reached[finite]))
+    if spec.config.sample_loss and not result.diverged:
+        loss = sample_loss(spec, result.states, result.inputs)
+        rows += (Assessment(result.n_steps, SAMPLE_LOSS, loss),)
     return dataclasses.replace(result, assessments=rows) if rows else result
 
 

@@ -29,6 +29,7 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, random_transitions
 from dopt.models.base import Model
+from dopt.models.gaussian_process import GaussianProcess
 from dopt.models.networks import MLP
 from dopt.policies.base import ball_norms, on_sphere
 from dopt.randomness import initial_weights, process_noise, stream
@@ -119,6 +120,30 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
     flow = np.stack(np.broadcast_arrays(*known, at[:, 0])[:-1], axis=-1)
     observed = np.diff(states, axis=0) / system.dt - flow
     return Samples(at, inputs, observed[:, list(system.learned_rows)])
+
+
+def sample_loss(spec: TrialSpec, states: Array, inputs: Array) -> float:
+    """Return how much of the system the samples of a trial tell, whatever its own learner was.
+
+    A Gaussian process is fitted to them, with the kernel that maximises its evidence. Its loss is
+    the root mean square error over the evaluation grid at the last step, as of the trial itself.
+
+    Parameters
+    ----------
+    spec : TrialSpec
+        The trial; its policy, model and learner make no difference.
+    states, inputs : (T + 1, d), (T, m)
+        Of the trial.
+
+    Raises
+    ------
+    SpecificationError
+        If the trial diverged, or does not record the samples of a model of the states: its model
+        reads inputs, its states are measured with noise, or it may have restarted.
+    """
+    process = TrialSpec(spec.config.process, spec.seed)
+    samples = recorded_samples(spec.system, states, inputs)
+    return fit_offline(process, samples.states, samples.accelerations).loss
 
 
 RIDGE = 1e-4
@@ -231,10 +256,16 @@ def fit_offline(
         parameters, steps, converged = _fit_networks(spec, points, y, initial, ridge, max_steps)
     elif spec.model.structure == "least_squares":
         parameters, steps, converged = _solve(spec, x, u, y, initial, ridge), 1, True
+    elif isinstance(spec.model, GaussianProcess):
+        from dopt.kernel.evidence import fit_process
+
+        parameters = fit_process(spec.model, spec.system, x, y, spec.seed)
+        steps, converged = 1, True
     else:
         raise SpecificationError(
-            f"model '{spec.model.name}' has no offline fit, but 'mlp', 'ensemble', or a model that "
-            f"is linear in its parameters, is expected: choose one of these."
+            f"model '{spec.model.name}' has no offline fit, but 'mlp', 'ensemble', "
+            f"'gaussian_process', or a model that is linear in its parameters, is expected: choose "
+            f"one of these."
         )
     residual = _root_mean_square(spec.model.predict(spec.system, parameters, x, u) - y)
     return OfflineFit(parameters, grid_loss(spec, parameters), residual, steps, converged)

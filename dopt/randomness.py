@@ -38,6 +38,7 @@ _STREAMS = {
     "sampled_parameters": 13,
     "measurement_noise": 14,
     "radii": 15,
+    "evidence": 16,
 }
 
 PLANNED_DIMENSIONS = 4

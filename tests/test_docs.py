@@ -238,8 +238,8 @@ def test_every_command_of_the_analysis_works(
 ) -> None:
     extra = {"animate": ("--frames", "2")}
     extra |= dict.fromkeys(("summary", "compare", "aggregate", "report"), ())
-    extra |= dict.fromkeys(("calibration", "log"), ())
-    if command.words[0] == "calibration":
+    extra |= dict.fromkeys(("calibration", "sample-loss", "log"), ())
+    if command.words[0] in ("calibration", "sample-loss"):
         monkeypatch.setenv("DOPT_DB", narrow_database)
     if command.words[0] == "log":
         rows = (f"{10 * k},{k * k // 50 % 4096},{k % 7 - 3}\n" for k in range(400))

@@ -199,17 +199,24 @@ def _first(
     return [config for config in configs if rank(config) == top]
 
 
-def nearness(config: ConfigRow) -> tuple[int, int, int]:
+def nearness(config: ConfigRow) -> tuple[int, int, int, bool]:
     """Return a key by which the configuration that is nearest to the defaults is the largest.
 
     The model and the learner that a launch takes by itself come first, then fewer values that are
-    not defaults of what is named, then no task: it changes nothing of the trial.
+    not defaults of what is named, then no task: it changes nothing of the trial. Last come stored
+    sample losses.
     """
     usual, parts = defaults(config), _sections(config)
     task = parts.pop("task", None) is not None
+    sampled = parts.pop("assess", None) is not None
     own = flatten(parts) if usual else {}
     names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
-    return -sum(names), -sum(usual.get(path) != value for path, value in own.items()), -task
+    return (
+        -sum(names),
+        -sum(usual.get(path) != value for path, value in own.items()),
+        -task,
+        sampled,
+    )
 
 
 def defaults(config: ConfigRow) -> dict[str, object]:
@@ -219,7 +226,8 @@ def defaults(config: ConfigRow) -> dict[str, object]:
     any. Empty if the system or the policy is a user's class, which is not registered here.
     """
     names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
-    names.pop("task", None)
+    for key in ("task", "assess"):
+        names.pop(key, None)
     limits = Limits().to_section() if names.pop("limits", None) else {}
     limits.pop("name", None)
     try:

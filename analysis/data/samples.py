@@ -14,7 +14,7 @@ import numpy.typing as npt
 from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
 from analysis.style import of_finished
-from dopt.assessment import Plane
+from dopt.assessment import SAMPLE_LOSS, Plane
 from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
@@ -120,6 +120,15 @@ def violation_shares(reader: Reader, entry: Entry) -> dict[int, float]:
     }
     finished = [trial.seed for trial in entry.finished]
     return {seed: float(counted[seed].sum()) for seed in finished if len(counted.get(seed, ())) > 0}
+
+
+def sample_losses(reader: Reader, entry: Entry) -> dict[int, float]:
+    """Return the stored sample losses of the trials that are done, by seed."""
+    found = reader.assessments(entry.config.config_key, SAMPLE_LOSS)
+    stored = dict(zip(found.seeds.tolist(), found.values[:, -1:].ravel().tolist(), strict=True))
+    return {
+        seed: stored[seed] for seed in entry.final_losses() if np.isfinite(stored.get(seed, np.nan))
+    }
 
 
 def coverages(reader: Reader, entry: Entry, plane: Plane) -> dict[int, float]:

@@ -311,8 +311,8 @@ def labelled(entries: Iterable[Entry], group_by: Sequence[str] = ("policy",)) ->
 
 
 def labels_of(configs: Iterable[ConfigRow]) -> list[str]:
-    """Return what differs among configurations; a task does not: it changes no loss."""
-    hidden = ("task", "assessment_version")
+    """Return what differs among configurations but the assessments, which change no loss."""
+    hidden = ("task", "assessment_version", "assess")
     return labels(
         [{k: v for k, v in config.config.items() if k not in hidden} for config in configs]
     )

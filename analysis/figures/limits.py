@@ -46,7 +46,7 @@ Pair = dict[bool, Entry]
 MOST_SEEDS = 20
 """Trials that are drawn of a configuration."""
 
-_APART = ("task", "assessment_version", "limits.enforced")
+_APART = ("task", "assess", "limits.enforced")
 """Beginnings of paths in which the configurations of a row may differ."""
 
 ROW_HEIGHT = 1.75

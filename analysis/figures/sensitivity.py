@@ -49,7 +49,7 @@ SETTINGS = ("policy.regularization", "learner.learning_rate", "learner.window")
 FEWEST = 3
 """Values of a setting from which they are a line."""
 
-_TASK = ("task", "assessment_version")
+_TASK = ("task", "assess")
 """Beginnings of paths of which no loss depends."""
 
 Family = tuple[Entry, dict[str, list[Entry]]]

@@ -31,6 +31,7 @@ from analysis.stats.curves import (
 )
 from analysis.stats.intervals import mean_columns
 from analysis.style import policy_style
+from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError
 from dopt.explorer.signs import STORED
 from dopt.spec.config import completed
@@ -63,6 +64,7 @@ COLUMNS = {
     "status": "status",
     "final_loss": "final loss",
     "best_loss": "best loss",
+    "sample_loss": "sample loss",
     "diverged_at": "diverged at",
     "wall_seconds": "wall time",
     "attempt": "attempts",
@@ -71,7 +73,10 @@ COLUMNS = {
 }
 """Columns of the list of trials with their headings; the list can be sorted by each."""
 
-NUMBERS = ("width", "seed", "final_loss", "best_loss", "diverged_at", "wall_seconds", "attempt")
+NUMBERS = (
+    *("width", "seed", "final_loss", "best_loss", "sample_loss"),
+    *("diverged_at", "wall_seconds", "attempt"),
+)
 """Columns that are aligned to the right."""
 
 PAGE_ROWS = 50
@@ -79,6 +84,14 @@ PAGE_ROWS = 50
 _FINAL = """
 SELECT config_key, final_loss FROM v_trial
 WHERE status = 'done' AND final_loss IS NOT NULL ORDER BY config_key, seed
+"""
+_SAMPLED = f"""
+SELECT config_key, value FROM v_assessment
+WHERE measure = '{SAMPLE_LOSS}' AND status = 'done' AND value IS NOT NULL ORDER BY config_key, seed
+"""
+_LISTED = f"""
+SELECT v_trial.*, (SELECT a.value FROM assessment a WHERE a.trial_id = v_trial.trial_id
+    AND a.t = v_trial.n_steps AND a.measure = '{SAMPLE_LOSS}') AS sample_loss FROM v_trial
 """
 _OUTCOMES = """
 SELECT launch_id, count(*) FILTER (WHERE outcome IN ('done', 'diverged')) AS finished,
@@ -147,8 +160,9 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
     configs = latest(reader, stored)
     fits = reader.rows(_FITS)
     finals = state.selections.get_or_compute(
-        ("final", reader, progress["token"]), lambda: _finals(reader)
+        ("final", reader, progress["token"]), lambda: _by_config(reader, _FINAL)
     )
+    losses = finals, _by_config(reader, _SAMPLED)
     policies, absent = _policies(configs), absent_pairs(configs)
     return {
         "progress": progress,
@@ -156,7 +170,7 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
         "environments": [
             {
                 "env": env,
-                "rows": _rows([one for one in configs if one.env == env], policies, absent, finals),
+                "rows": _rows([c for c in configs if c.env == env], policies, absent, losses),
             }
             for env in _environments(configs)
         ],
@@ -166,9 +180,9 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
     }
 
 
-def _finals(reader: Reader) -> dict[str, Array]:
+def _by_config(reader: Reader, sql: str) -> dict[str, Array]:
     losses: dict[str, list[float]] = {}
-    for config_key, loss in reader.rows(_FINAL):
+    for config_key, loss in reader.rows(sql):
         losses.setdefault(config_key, []).append(loss)
     return {config_key: np.array(values) for config_key, values in losses.items()}
 
@@ -177,12 +191,15 @@ def _rows(
     configs: Sequence[ConfigRow],
     policies: Sequence[str],
     absent: Sequence[tuple[str, str]],
-    finals: Mapping[str, Array],
+    losses: Sequence[Mapping[str, Array]],
 ) -> list[Content]:
     """Return a row for each width of an environment, with a cell for each policy."""
     widths = _widths(configs)
     only = widths[0] if len(widths) == 1 else None
-    tiles = [_tile(config, finals.get(config.config_key, np.empty(0))) for config in configs]
+    tiles = [
+        _tile(config, *(one.get(config.config_key, np.empty(0)) for one in losses))
+        for config in configs
+    ]
     for kind in (False, True):  # prequential losses have another scale
         _shade([t for c, t in zip(configs, tiles, strict=True) if is_prequential(c.config) is kind])
     cells: dict[tuple[int | None, str], list[tuple[ConfigRow, Content]]] = {}
@@ -208,7 +225,7 @@ def _rows(
     ]
 
 
-def _tile(config: ConfigRow, losses: Array) -> Content:
+def _tile(config: ConfigRow, losses: Array, samples: Array) -> Content:
     counts = {status: int(getattr(config, f"n_{status}")) for status in STATUSES}
     return {
         "config_key": config.config_key,
@@ -217,6 +234,7 @@ def _tile(config: ConfigRow, losses: Array) -> Content:
         "ended": config.n - config.n_pending - config.n_running,
         "counts": {status: count for status, count in counts.items() if count},
         **mean_columns("loss", losses),
+        **(mean_columns("sample_loss", samples) if len(samples) else {}),
         "n_used": len(losses),
     }
 
@@ -373,7 +391,7 @@ def trials(state: ServerState, params: QueryParams) -> Content:
     page = params.integer("page", low=1) or 1
     total = int(reader.rows(f"SELECT count(*) AS n FROM v_trial WHERE {where}", **wanted)[0].n)
     found = reader.rows(
-        f"SELECT trial_key, label, {', '.join(COLUMNS)} FROM v_trial WHERE {where} "
+        f"SELECT trial_key, label, {', '.join(COLUMNS)} FROM ({_LISTED}) AS v WHERE {where} "
         f"ORDER BY CASE WHEN {sort} IS NULL THEN 1 ELSE 0 END, {sort} {order}, trial_id "
         f"LIMIT {PAGE_ROWS} OFFSET {PAGE_ROWS * (page - 1)}",
         **wanted,

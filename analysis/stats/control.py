@@ -185,7 +185,7 @@ def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
         ratios = relative_costs(moment, entry).values
     reached = np.isfinite(successes.values)
     success, success_low, success_high = _by_step(_rate, successes.values)
-    cost, cost_low, cost_high = _by_step(_mean_ratio, ratios)
+    cost, cost_low, cost_high = _by_step(geometric_mean, ratios)
     return ControlCurve(
         entry.config.env,
         entry.config.policy,
@@ -240,7 +240,7 @@ def _usable(values: Array) -> npt.NDArray[np.bool_]:
     return np.isfinite(values) & (values > 0)
 
 
-def _mean_ratio(ratios: Array) -> Interval:
+def geometric_mean(ratios: Array) -> Interval:
     """Return the geometric mean of the finite ones of (n,), with Student's interval."""
     known = np.log(ratios[_usable(ratios)])
     found = band(known[:, None])

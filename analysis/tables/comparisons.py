@@ -19,7 +19,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import nearness
-from analysis.data.samples import DivergenceRule
+from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError
 from analysis.stats.control import relative_costs, scores_at
@@ -325,7 +325,8 @@ def summarise(
 ) -> pd.DataFrame:
     """Return centres of the final losses, one row for each environment and policy.
 
-    For both losses the mean with two standard errors, the median and the interquartile mean.
+    For both losses the mean with two standard errors, the median and the interquartile mean; and
+    the mean of the sample losses where some are stored.
     """
     return pd.DataFrame([_summary(reader, entry, rule) for entry in selection.entries])
 
@@ -338,5 +339,7 @@ def _summary(reader: Reader, entry: Entry, rule: DivergenceRule) -> dict[str, ob
         row |= mean_columns(name, found.values)
         row[f"{name}_median"] = float(centre(found.values, Statistic.MEDIAN))
         row[f"{name}_iqm"] = float(centre(found.values, Statistic.IQM))
+    if sampled := sample_losses(reader, entry):
+        row |= mean_columns("sample_loss", np.array([*sampled.values()]))
     grid = scores["loss"]
     return row | {"n": len(grid.by_seed), "n_diverged": grid.n_diverged}

@@ -166,6 +166,11 @@ def _paired(
     )
 
 
+def sample_loss_columns(stored: bool) -> Columns:
+    """Return the column of the sample losses of a table, empty where none are stored."""
+    return [("sample loss", mean_text("sample_loss"))] if stored else []
+
+
 def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
     """Return the table of final losses: mean ± 2 SE, median, IQM and n."""
     columns: Columns = (
@@ -175,6 +180,7 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
         ("median", text_of("loss_median", number)),
         ("IQM", text_of("loss_iqm", number)),
         ("final reachable-set loss", mean_text("reachable_loss")),
+        *sample_loss_columns("sample_loss" in table),
         ("n", itemgetter("n")),
         ("diverged", itemgetter("n_diverged")),
     )
@@ -182,6 +188,8 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
         f"Diverged trials: {rule}."
     )
+    if "sample_loss" in table:
+        note += " Sample loss: mean over the trials of which one is stored (analysis sample-loss)."
     return rendered(table, columns, note)
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import Filter, difference, latest_sources, nearness, newest
-from analysis.data.samples import DivergenceRule, coverages, read_curves
+from analysis.data.samples import DivergenceRule, coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
     Selection,
@@ -153,7 +153,9 @@ def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
 def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | None:
     world = one_world(entries)
     task = common_task(world)
-    kept = one_each(world, lambda one: (task_of(one) == task, len(one.trials)))
+    kept = one_each(
+        world, lambda one: (task_of(one) == task, len(one.trials), "assess" in one.config.config)
+    )
     references = [entry for entry in kept if entry.config.policy == policy]
     if not references or len(kept) < 2:
         return None
@@ -289,6 +291,8 @@ def _variant_row(
         values = np.array(list(own[measure].values()))
         row |= mean_columns(measure, values[np.isfinite(values)])
         row |= _against(own, reference, variant, measure)
+    if sampled := sample_losses(reader, variant):
+        row |= mean_columns("sample_loss", np.array([*sampled.values()]))
     row["control_lost"] = without_ratio(*paired(own["control"], reference["control"]))
     same = group.reference_with_setting_of(variant) or variant
     row[f"{SAME}_reference"] = "" if same is variant else same.label

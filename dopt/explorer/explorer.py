@@ -29,17 +29,17 @@ from dopt.arguments import (
 )
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
-from dopt.explorer.refit import FitBeside
+from dopt.explorer.refit import FitBeside, first_evidence, first_simulation
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
-from dopt.learning import Learner, SimulationError
-from dopt.models import MLP, Model
+from dopt.learning import Conditioning, Learner, SimulationError
+from dopt.models import Model
 from dopt.policies import Policy
 from dopt.spec.config import LARGEST_HORIZON, completed
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.plant import ExploredPlant, Plant
+from dopt.systems.plant import Plant
 from dopt.types import Array
 
 # Calls that Ctrl-C does not break off.
@@ -264,7 +264,11 @@ class Explorer(SavedExplored):
         self._unlearned = UnlearnedStates(spec.system.dt)
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
         self._planner = PunctualPlanner(self._state.plan, deadline)
-        self._fits = FitBeside() if isinstance(spec.learner, SimulationError) else None
+        self._fits: FitBeside | None = None
+        if isinstance(spec.learner, SimulationError):
+            self._fits = FitBeside(first_simulation())
+        elif self._state.steps.evidence is not None:
+            self._fits = FitBeside(first_evidence())
         self._waits = deadline is None
         if self._journal is not None:
             self._resume(self._journal)
@@ -401,20 +405,17 @@ class Explorer(SavedExplored):
 
         Without a deadline a fit is waited for when the next one is due.
         """
-        learner, model, run = self.spec.learner, self.spec.model, self._state.run
-        assert isinstance(learner, SimulationError)
-        assert isinstance(model, MLP)
-        due = max(learner.first_rows, (1.0 + learner.growth) * max(run.fitted, fits.rows))
-        if fits.is_ready or (fits.is_running and self._waits and run.rows >= due):
+        state, learner, rows = self._state, self.spec.learner, self._state.run.rows
+        assert isinstance(learner, SimulationError | Conditioning)
+        due = max(learner.first_rows, (1.0 + learner.growth) * max(state.run.fitted, fits.rows))
+        if fits.is_ready or (fits.is_running and self._waits and rows >= due):
             found = fits.take()
             if isinstance(found, str):
                 _log.warning("no fit to %d rows came into force: %s", fits.rows, found)
             else:
-                self._note(self._state.refitted(found, fits.rows))
-        if not fits.is_running and run.rows >= due and self.n_steps < self.spec.system.horizon:
-            assert isinstance(self.spec.system, ExploredPlant)
-            plant = self.spec.system.plant
-            fits.begin(plant, run.log(plant), run.rows, model.width, self.spec.seed)
+                self._note(state.refitted(found, fits.rows))
+        if not fits.is_running and rows >= due and self.n_steps < self.spec.system.horizon:
+            fits.begin(state.fit_request(), rows)
 
     def _elapsed(self, now: float | None) -> float:
         """Return the seconds since the last state."""

@@ -12,8 +12,10 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.explorer.refit import Found
 from dopt.fitting.fit import fit
+from dopt.kernel.evidence import Request, fit_rows
 from dopt.log import Log
 from dopt.systems.plant import Plant
+from dopt.types import Array
 
 WEIGHTS = (30.0, 10.0, 3.0, 1.0)
 """Weights s that the fits try (:func:`dopt.fit`)."""
@@ -41,7 +43,9 @@ def serve() -> None:
         except EOFError:
             return
         try:
-            answer: Found | str = _found(*request)
+            answer: Found | Array | str = (
+                fit_rows(request) if isinstance(request, Request) else _found(*request)
+            )
         except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
             answer = str(error)
         try:

@@ -16,7 +16,7 @@ import sys
 import threading
 import weakref
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,12 @@ from dopt.log import Log, Piece
 from dopt.spec.scaled import Scaled
 from dopt.systems.plant import Plant, unknown
 from dopt.types import Array
+
+if TYPE_CHECKING:
+    from dopt.kernel.evidence import Request  # which loads the compiler
+
+    FitRequest = tuple[Plant, Log, int, int] | Request
+    """What a fit is given: plant, log, units of the network, seed; or samples of processes."""
 
 
 class Recording:
@@ -124,7 +130,15 @@ class Found(NamedTuple):
         return np.concatenate([(W1 * gain).ravel(), b1 + W1 @ shift, outputs * of_rows])
 
 
-def _first_request() -> tuple[Plant, Log, int, int]:
+def first_evidence() -> Request:
+    """Return a small fit of the evidence."""
+    from dopt.kernel.evidence import Request
+
+    y = np.sin(np.arange(4.0))
+    return Request(y[None], y[None], np.ones(4), np.ones((1, 1, 5)), None)
+
+
+def first_simulation() -> tuple[Plant, Log, int, int]:
     """Return a small fit: dx/dt = -a x + u."""
     u, x = np.sign(np.sin(np.arange(150.0))), np.zeros(150)
     for k in range(149):
@@ -154,13 +168,13 @@ class FitBeside:
         Rows of the log that was given last.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: FitRequest) -> None:
         self.rows = 0
         self._thread = ThreadPoolExecutor(1, "fit")
         self._starting, self._is_closed = threading.Lock(), False
         self._process: subprocess.Popen[bytes] | None = None
-        self._answer: Future[Found | str] | None = None
-        self._thread.submit(self._ask, _first_request())  # compiled before the first fit is due
+        self._answer: Future[Found | Array | str] | None = None
+        self._thread.submit(self._ask, first)  # compiled before the first fit is due
 
     @property
     def is_running(self) -> bool:
@@ -170,18 +184,18 @@ class FitBeside:
     def is_ready(self) -> bool:
         return self._answer is not None and self._answer.done()
 
-    def begin(self, plant: Plant, log: Log, rows: int, width: int, seed: int) -> None:
-        """Begin a fit."""
+    def begin(self, request: FitRequest, rows: int) -> None:
+        """Begin a fit to so many rows."""
         self.rows = rows
-        self._answer = self._thread.submit(self._ask, (plant, log, width, seed))
+        self._answer = self._thread.submit(self._ask, request)
 
-    def take(self) -> Found | str:
+    def take(self) -> Found | Array | str:
         """Wait for what the fit has found, or for the sentence that says why there is nothing."""
         assert self._answer is not None
         answer, self._answer = self._answer, None
         return answer.result()
 
-    def _ask(self, request: tuple[Any, ...]) -> Found | str:
+    def _ask(self, request: FitRequest) -> Found | Array | str:
         with self._starting:
             if self._is_closed:
                 return "the exploration is closed"
@@ -193,7 +207,7 @@ class FitBeside:
         try:
             pickle.dump(request, self._process.stdin)
             self._process.stdin.flush()
-            answer: Found | str = pickle.load(self._process.stdout)  # of our own process
+            answer: Found | Array | str = pickle.load(self._process.stdout)  # of our own process
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             _end(self._process)
             return f"its process has ended ({type(error).__name__}); another one begins"

@@ -28,7 +28,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
 from dopt.explorer.refit import Found, Recording
 from dopt.explorer.signs import Signs
-from dopt.learning import SimulationError
+from dopt.learning import Conditioning, SimulationError
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.scaled import scaled, scaled_trial
@@ -45,6 +45,10 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import next_state
 from dopt.systems.plant import ExploredPlant
 from dopt.types import Array
+
+if TYPE_CHECKING:
+    from dopt.explorer.refit import FitRequest
+    from dopt.kernel.evidence import Evidence  # which loads the compiler
 
 # A planner that is waited for until a deadline.
 
@@ -133,6 +137,8 @@ class Steps(Protocol):
     def parameters(self) -> Array: ...
     @property
     def errors(self) -> Array: ...
+    @property
+    def evidence(self) -> Evidence | None: ...
     def measure(self, t: int, measured: Array) -> None: ...
     def reached(self, t: int, inputs: Array, seconds: Array) -> Array: ...
     def note_asked(self, u: Array) -> None: ...
@@ -230,15 +236,30 @@ class ExplorerState:
         else:
             self.counts[event["counted"]] += 1
 
-    def refitted(self, found: Found, rows: int) -> Event:
+    def fit_request(self) -> FitRequest:
+        """Return what a fit beside the exploration is given."""
+        if self.steps.evidence is not None:
+            return self.steps.evidence.request()
+        assert isinstance(self.spec.model, MLP)
+        assert isinstance(self.spec.system, ExploredPlant)
+        plant = self.spec.system.plant
+        return plant, self.run.log(plant), self.spec.model.width, self.spec.seed
+
+    def refitted(self, found: Found | Array, rows: int) -> Event:
         """Return the event of a fit to so many rows that comes into force."""
+        if isinstance(found, np.ndarray):
+            return {"refit": found.ravel().tolist(), "fitted": [], "rows": rows}
         assert isinstance(self.spec.model, MLP)
         theta = found.parameters(self._scaled, self.spec.model.width, self.steps.parameters)
         return {"refit": theta.tolist(), "fitted": found.fitted, "rows": rows}
 
     def _refit(self, event: Event) -> None:
-        assert isinstance(self.system, ExploredPlant)
         self.counts["refits"] += 1
+        if self.steps.evidence is not None:
+            numbers = np.array(event["refit"]).reshape(self.steps.evidence.numbers.shape)
+            self.steps.evidence.take(numbers, event["rows"])
+            return
+        assert isinstance(self.system, ExploredPlant)
         self.system = dataclasses.replace(self.system, fitted=tuple(event["fitted"]))
         self._scaled = scaled(self.system)
         self.steps.replace(np.array(event["refit"]), np.array(event["fitted"][:-2]))
@@ -251,7 +272,9 @@ class ExplorerState:
         whole = is_event(event, len(self._measured), self.spec.system.n_inputs)
         if "refit" in event:
             sizes = len(self.steps.parameters), len(self.system.parameters) + 2
-            fits = isinstance(self.spec.learner, SimulationError)
+            if self.steps.evidence is not None:
+                sizes = self.steps.evidence.numbers.size, 0
+            fits = isinstance(self.spec.learner, SimulationError | Conditioning)
             whole &= fits and (len(event["refit"]), len(event["fitted"])) == sizes
         return whole and (follows or not needs_state)
 

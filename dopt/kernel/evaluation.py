@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel.compiler import compiled, squared
-from dopt.kernel.model_kinds import kernel_value, mean_weights, write_values
-from dopt.kernel.network import features_at, mean_forward
+from dopt.kernel.compiler import compiled
+from dopt.kernel.gaussian_process import mean_weights
+from dopt.kernel.model_kinds import write_values
+from dopt.kernel.network import mean_forward
 from dopt.kernel.structs import Evaluation, Network, Plant
 from dopt.kernel.vectors import inner, multiply
 from dopt.types import Matrix, Real, Singles, Vector
@@ -64,8 +65,8 @@ def model_error(
         W = theta.reshape(r, points.basis.shape[1])
         return _combination_error(W, points, start, stop, buffers.outputs)
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        alpha = mean_weights(network, theta, r)[: points.n_basis[0]]
-        return _combination_error(alpha.T.copy(), points, start, stop, buffers.outputs)
+        alpha = mean_weights(network, theta, r)[:, : points.n_basis[0]]
+        return _process_error(alpha, points, start, stop, buffers.outputs)
     hidden_single, outputs_single, hidden, outputs, thetas_single, one_single, one = buffers
     for k in range(thetas.shape[0]):
         for i in range(thetas.shape[1]):
@@ -117,6 +118,23 @@ def _combination_error(
     total, count = 0.0, 0
     for block in range(start, stop):
         multiply(W, points.basis[block], outputs)
+        used = points.block_sizes[block]
+        total += _squared_errors(outputs, points.block_targets[block], used)
+        count += used
+    return float(np.sqrt(total / count)) if count else np.nan
+
+
+@compiled
+def _process_error(
+    alpha: Matrix, points: Evaluation, start: int, stop: int, outputs: Matrix
+) -> float:
+    """Return the error of means with weights (r, n), of which each kernel has a basis."""
+    total, count, G = 0.0, 0, points.basis.shape[0] // points.bounds[2]
+    r, n = alpha.shape[0] // G, alpha.shape[1]
+    for block in range(start, stop):
+        for g in range(G):
+            basis = points.basis[G * block + g, :n]
+            multiply(alpha[g * r : (g + 1) * r], basis, outputs[g * r : (g + 1) * r])
         used = points.block_sizes[block]
         total += _squared_errors(outputs, points.block_targets[block], used)
         count += used
@@ -179,22 +197,6 @@ def evaluation_buffers(network: Network, thetas: Matrix, r: int) -> Buffers:
         np.empty((r, BLOCK), np.float32),
         np.empty((r, BLOCK)),
     )
-
-
-@compiled
-def add_sample(network: Network, points: Evaluation, x: Vector) -> None:
-    """Write the kernel of a Gaussian process between a new sample, at a state, and all points."""
-    phi, n = np.empty(network.sizes[0]), points.n_basis[0]
-    features_at(network, x, phi)
-    for block in range(points.bounds[2]):
-        features, out = points.features[block], points.basis[block, n]
-        out[:] = 0.0
-        for j in range(phi.shape[0]):
-            for i in range(out.shape[0]):
-                out[i] += squared(phi[j] - features[j, i])
-        for i in range(out.shape[0]):
-            out[i] = kernel_value(network, out[i])
-    points.n_basis[0] = n + 1
 
 
 @compiled

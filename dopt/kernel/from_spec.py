@@ -12,6 +12,7 @@ from dopt.kernel import information
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation import BLOCK
+from dopt.kernel.evidence import Evidence, is_tuned
 from dopt.kernel.state_from_spec import (
     empty_record,
     empty_scratch,
@@ -120,7 +121,7 @@ def algorithm_of(config: TrialConfig) -> args.Algorithm:
 
 def information_of(config: TrialConfig) -> args.Information:
     """Return the functions for the form that holds M, which are compiled when a trial runs."""
-    if not isinstance(config.policy, InformationPolicy):
+    if not isinstance(config.policy, InformationPolicy) or held_form(config) is None:
         return information.ABSENT
     network = isinstance(config.model, MLP)
     form = FORMS_OF_NETWORKS[Form(form_of(config))] if network else information.OF_OTHER_MODELS
@@ -219,6 +220,7 @@ class KernelState:
         draws = draw(spec)
         self.spec, self.trial = spec, trial_of(spec, draws)
         self.state, self.record = self.trial.state, self.trial.record
+        self.evidence = Evidence(spec, self.trial) if is_tuned(spec.model) else None
         n_fixed = spec.model.n_fixed_parameters(spec.system)
         self._fixed = draws.weights[len(draws.weights) - n_fixed :]
 
@@ -276,9 +278,7 @@ def _followed(system: System, points: EvaluationSet) -> Array:
     return followed if len(system.history) > 1 else followed[:0]
 
 
-def points_of_trial(
-    points: args.Evaluation, network: args.Network, horizon: int
-) -> args.Evaluation:
+def points_of_trial(points: args.Evaluation, network: args.Network) -> args.Evaluation:
     """Return points with what a trial has for itself.
 
     These are its random features at the points, or room for the kernel between the points and its
@@ -296,7 +296,8 @@ def points_of_trial(
     elif network.kind == ModelKind.LINEAR_STATE:
         points = points._replace(basis=points.features)
     elif network.kind == ModelKind.GAUSSIAN_PROCESS:
-        room = np.zeros((points.bounds[2], horizon, BLOCK))
+        kernels = network.sizes[2] if len(network.process.shared) == 0 else 1
+        room = np.zeros((kernels * points.bounds[2], network.process.room, BLOCK))
         points = points._replace(basis=room, n_basis=np.zeros(1, dtype=np.int64))
     return points
 

@@ -15,18 +15,17 @@ from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import called_from_python, compiled, copy_into, monotonic_microseconds
 from dopt.kernel.evaluation import (
     Buffers,
-    add_sample,
     evaluation_buffers,
     follow_truth,
     model_error,
 )
+from dopt.kernel.gaussian_process import add_to_points
 from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.integration import input_columns, next_model_state, next_true_state
 from dopt.kernel.learners.adam import sampled_point
 from dopt.kernel.model import (
     model_accelerations,
     rows_at,
-    sampled_state,
     within,
     write_model_gradients,
     write_network_gradients,
@@ -240,7 +239,8 @@ def evaluate(trial: Trial, points: Evaluation, t: int, thetas: Matrix, buffers: 
     plant, network, record, bounds = trial.plant, trial.network, trial.record, points.bounds
     start = monotonic_microseconds()
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        add_sample(network, points, sampled_state(plant, record.states, t))
+        r = plant.learned_rows.shape[0]
+        add_to_points(network, trial.state.theta, r, points)
     if plant.history.shape[0] > 1:
         follow_truth(plant, network, points, t)
     loss = model_error(plant, network, thetas, points, bounds[0], bounds[1], buffers)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import Integrator, ModelKind
-from dopt.kernel import model_kinds
+from dopt.kernel import gaussian_process, model_kinds
 from dopt.kernel import network as nn
 from dopt.kernel import network_gradients as backward
 from dopt.kernel import network_gradients as tangents
@@ -185,7 +185,7 @@ def model_accelerations(
 ) -> None:
     """Write a_θ, (r,), at a point x."""
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        model_kinds.write_mean(network, theta, x, out)
+        gaussian_process.write_mean(network, theta, x, out)
         return
     if network.kind == ModelKind.GREY_BOX:
         plant.accelerations(x, model_kinds.constants_with(plant, network, theta), out)
@@ -228,6 +228,9 @@ def accelerations_at(
     N, r = states.shape[0], outputs.shape[0]
     if network.kind == ModelKind.GREY_BOX:
         model_kinds.write_values(plant, network, theta, states.T, outputs)
+        return
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        gaussian_process.write_means(network, theta, states, outputs)
         return
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)

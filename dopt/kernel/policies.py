@@ -5,8 +5,7 @@ each step, 0 if one is drawn. For a model that reads inputs the input of the nex
 well: uniformly on the sphere, or from the ball for a model that is not affine in the inputs, whose
 planned inputs have drawn norms. Uniform exploration: the number is the count of ascent steps.
 
-Predictive entropy of held candidates: C candidates, H steps for which one is held, n samples taken,
-L their Cholesky factor (:mod:`dopt.kernel.learners.kalman`).
+Predictive entropy of held candidates: C candidates, H steps for which one is held.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import TIE_MARGIN
+from dopt.kernel import gaussian_process as gp
 from dopt.kernel.compiler import compilable, compiled, squared
 from dopt.kernel.integration import (
     arrival_columns,
@@ -21,17 +21,10 @@ from dopt.kernel.integration import (
     point_columns,
     predicted_state,
 )
-from dopt.kernel.linear_algebra import factorize, solve_lower
-from dopt.kernel.model import euler_step, model_point
-from dopt.kernel.model_kinds import (
-    mean_weights,
-    sample_features,
-    write_combination,
-    write_kernel,
-    write_mean,
-)
-from dopt.kernel.network import features_at
-from dopt.kernel.structs import Network, Trial
+from dopt.kernel.linear_algebra import factorize
+from dopt.kernel.model import model_point
+from dopt.kernel.search.path import advance_paths, keep_points, paths_from
+from dopt.kernel.structs import Trial
 from dopt.kernel.vectors import inner
 from dopt.sphere import sphere_maximizer
 from dopt.types import Matrix, Vector
@@ -148,62 +141,30 @@ def _distances(
 @compiled
 def plan_held_candidates(trial: Trial, t: int, u: Vector) -> None:
     """Write the candidate of the largest entropy, (m,); of equal ones the first."""
-    search, posterior = trial.algorithm.search, trial.state.posterior
-    C, H, n = search.candidates.shape[0], search.steps, posterior.n_samples[0]
-    visited = np.empty((C * H, trial.network.sizes[0]))
-    rows = np.empty((C * H, n))
-    _write_paths(trial, t, visited, rows)
-    solve_lower(posterior.factor, n, rows)
-    best = -np.inf
+    plant, network, search, state = trial.plant, trial.network, trial.algorithm.search, trial.state
+    (C, m), H, d = search.candidates.shape, search.steps, trial.record.states.shape[1]
+    starts, visited = np.empty((C, d)), np.empty((C * H, d))
+    starts[:] = trial.record.states[t]
+    paths, held = paths_from(plant, network, starts), search.candidates.reshape(C, 1, m)
+    for i in range(H):
+        advance_paths(plant, network, state.theta, paths, held, 0)
+        keep_points(plant, network, paths, i, H, visited)
+    # Components that share a kernel have the same entropy.
+    r = plant.learned_rows.shape[0] if network.process.shared.shape[0] == 0 else 1
+    rows = np.empty((C * H * r, network.process.n_samples[0]))
+    features = np.empty((C * H * r, network.sizes[0]))
+    gp.write_rows(network, state, r, visited, rows, features)
+    numbers = gp.numbers_by_row(network, state.theta, r)
+    best, covariance = -np.inf, np.empty((H * r, H * r))
     u[:] = search.candidates[0]
     for c in range(C):
-        own = slice(c * H, (c + 1) * H)
-        value = _entropy(trial.network, visited[own], rows[own])
+        first = c * H * r
+        for i in range(H * r):
+            for j in range(i, H * r):
+                covariance[i, j] = gp.information(numbers, features, rows, first + i, first + j)
+            covariance[i, i] += 1.0
+        # Rounding may leave it indefinite.
+        value = 2.0 * np.log(np.diag(covariance)).sum() if factorize(covariance) else -np.inf
         if value > best:
             best = value
             u[:] = search.candidates[c]
-
-
-@compiled
-def _write_paths(trial: Trial, t: int, visited: Matrix, rows: Matrix) -> None:
-    """Write the features of the states that the candidates lead to, (C H, p), path by path.
-
-    Their kernel with the samples, (C H, n), is written as well.
-    """
-    plant, network, search = trial.plant, trial.network, trial.algorithm.search
-    theta, n, r = trial.state.theta, rows.shape[1], plant.learned_rows.shape[0]
-    phi, alpha = sample_features(network, theta, r)[:n], mean_weights(network, theta, r)[:n]
-    first, value = np.empty(r), np.empty(r)
-    d = trial.record.states.shape[1]
-    x, flow, following = np.empty(d), np.empty(d), np.empty(d)
-    write_mean(network, theta, trial.record.states[t], first)
-    for c in range(search.candidates.shape[0]):
-        x[:] = trial.record.states[t]
-        value[:] = first
-        for i in range(c * search.steps, (c + 1) * search.steps):
-            euler_step(plant, x, search.candidates[c], value, flow, following)
-            x[:] = following
-            features_at(network, x, visited[i])
-            write_kernel(network, visited[i], phi, rows[i])
-            write_combination(rows[i], alpha, value)
-
-
-@compiled
-def _entropy(network: Network, phi: Matrix, whitened: Matrix) -> float:
-    """Return log det of the covariance of observations at features (H, p), given L⁻¹k, (H, n).
-
-    It is -∞ where rounding has left the covariance indefinite.
-    """
-    H = phi.shape[0]
-    covariance = np.empty((H, H))
-    for i in range(H):
-        write_kernel(network, phi[i], phi, covariance[i])
-        for j in range(H):
-            covariance[i, j] -= inner(whitened[i], whitened[j])
-        covariance[i, i] += network.process.noise_variance
-    if not factorize(covariance):
-        return -np.inf
-    total = 0.0
-    for i in range(H):
-        total += 2.0 * np.log(covariance[i, i])
-    return total

@@ -43,7 +43,7 @@ class KernelTrial(KernelState):
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
         shared = shared_points(spec.config)
-        self.points = points_of_trial(shared, self.trial.network, spec.system.horizon)
+        self.points = points_of_trial(shared, self.trial.network)
         self.done = 0
         self.diverged_at: int | None = None
         self.feedback: Feedback | None = None  # no compiled policy learns one
@@ -73,10 +73,14 @@ class KernelTrial(KernelState):
         if self.diverged_at is not None or last <= self.done:
             return
         before = self.done
-        self.done = self._code.advance(self.held, self.points, self.done, last)
+        while self.done < last and self.diverged_at is None:
+            stop = min(last, self.evidence.due) if self.evidence else last
+            self.done = self._code.advance(self.held, self.points, self.done, stop)
+            if self.done < stop:
+                self.diverged_at = self.done
+            elif self.evidence and self.done == self.evidence.due:
+                self.record.learn_us[self.done - 1] += self.evidence.fit(self.points)
         _check_inputs(self.spec, self.record.inputs, before, self.done)
-        if self.done < last:
-            self.diverged_at = self.done
 
 
 def _check_inputs(spec: TrialSpec, inputs: Array, first: int, last: int) -> None:

@@ -77,13 +77,22 @@ def network_of(system: System, model: Model) -> args.Network:
 
 
 def _process(system: System, model: Model) -> args.Process:
+    room, shared = 0, np.zeros((0, 0))
     if isinstance(model, GaussianProcess):
-        return args.Process(model.lengthscale, model.amplitude, model.noise_variance(system))
-    return args.Process(1.0, 1.0, 1.0)
+        room = model.room(system)
+        if not model.is_tuned:
+            shared = model.fixed_numbers(system)[None]
+    selects_from = room if room == system.horizon else room // 2
+    return args.Process(shared, room, selects_from, np.zeros(1, dtype=np.int64))
 
 
 def network_of_trial(spec: TrialSpec, network: args.Network, weights: Vector) -> args.Network:
-    """Return the architecture with the random features that a trial has drawn in its weights."""
+    """Return the architecture with what belongs to one trial.
+
+    These are the random features that it has drawn in its weights, and the count of its samples.
+    """
+    if isinstance(spec.model, GaussianProcess):
+        return network._replace(process=_process(spec.system, spec.model))
     if not isinstance(spec.model, RFF):
         return network
     D, p = spec.model.n_features, len(spec.system.features)
@@ -203,10 +212,12 @@ def _estimate(spec: TrialSpec, q: int, applied: Matrix) -> args.Estimate:
 
 
 def _posterior(spec: TrialSpec) -> args.Posterior:
-    """Return the room for the samples of a Gaussian process, none in other models."""
-    T = spec.system.horizon if isinstance(spec.model, GaussianProcess) else 0
-    solved = np.zeros((T, spec.system.n_learned))
-    return args.Posterior(np.zeros((T, T)), solved, np.zeros(1, dtype=np.int64))
+    """Return the room for the samples of Gaussian processes, none in other models."""
+    room, kernels, r = 0, 0, spec.system.n_learned
+    if isinstance(spec.model, GaussianProcess):
+        room, kernels = spec.model.room(spec.system), r if spec.model.is_tuned else 1
+    factors = np.zeros((kernels, room, room))
+    return args.Posterior(factors, np.zeros((r, room)), np.zeros((r, room)), np.zeros(room))
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:

@@ -313,7 +313,7 @@ class SteppedTrial(KernelSteps):
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
         shared = shared_points(spec.config)
-        self.points = points_of_trial(shared, self.trial.network, spec.system.horizon)
+        self.points = points_of_trial(shared, self.trial.network)
         self.done = 0
         self.diverged_at: int | None = None
         self._evaluate = compiled_evaluation(self.trial, self.points)
@@ -343,7 +343,10 @@ class SteppedTrial(KernelSteps):
         if isinstance(self.spec.policy, CompiledPolicy):
             check_norms(self.spec.policy.name, self.inputs[t : t + 1], t, self.spec.system.gamma)
         inside, dt = self._go_on(t), self.spec.system.dt
-        return inside and self.take_in(t, dt) and self._evaluate(self._held, self.points, t)
+        goes_on = inside and self.take_in(t, dt) and self._evaluate(self._held, self.points, t)
+        if goes_on and self.evidence and t + 1 == self.evidence.due:
+            self.record.learn_us[t] += self.evidence.fit(self.points)
+        return goes_on
 
     def _go_on(self, t: int) -> bool:
         """Let the system go on to x_{t+1}, and return whether that is within its limit."""

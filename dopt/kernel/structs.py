@@ -74,14 +74,15 @@ class Visited(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """Samples of a Gaussian process (:mod:`dopt.kernel.learners.kalman`).
+    """Samples of Gaussian processes (:mod:`dopt.kernel.gaussian_process`), with room for C.
 
     Empty in other models.
     """
 
-    factor: Matrix  # (T, T), L in the lower triangle
-    solved: Matrix  # (T, r), z
-    n_samples: Integers  # (1,)
+    factors: Stack  # (G, C, C), L of each kernel in the lower triangle
+    targets: Matrix  # (r, C)
+    solved: Matrix  # (r, C), z
+    counts: Vector  # (C,) observations of which each sample is the mean
 
 
 class Linearization(NamedTuple):
@@ -197,11 +198,12 @@ class Waves(NamedTuple):
 
 
 class Process(NamedTuple):
-    """Gaussian process (:mod:`dopt.kernel.model_kinds`); ones in other models."""
+    """Gaussian processes (:mod:`dopt.kernel.gaussian_process`); empty in other models."""
 
-    lengthscale: float  # ℓ
-    amplitude: float  # s
-    noise_variance: float  # of an observed acceleration
+    shared: Matrix  # (1, 2p + 3), numbers of the kernel of all rows; (0, ·) where θ holds them
+    room: int  # C
+    selects_from: int  # samples from which on one that adds little is merged; C where all have room
+    n_samples: Integers  # (1,)
 
 
 class Network(NamedTuple):

@@ -18,6 +18,7 @@ from collections.abc import Callable, Container, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import _dynfunc
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.cpu import CPUContext
@@ -25,6 +26,7 @@ from numba.core.targetconfig import ConfigStack
 
 from dopt.kernel import cache, loop
 from dopt.kernel.equations import compiled_equations, name_of_equations
+from dopt.kernel.gaussian_process import negative_evidence, refactor, thin
 from dopt.kernel.information import FORMS, NETWORK
 from dopt.kernel.loop import advance, evaluate_next
 from dopt.kernel.pointers import (
@@ -34,8 +36,10 @@ from dopt.kernel.pointers import (
     compile_form,
     compiled_at,
     compiled_evaluation,
+    compiled_for,
     compiled_loop,
     compiled_step,
+    kind_of,
     path_of,
     step_kinds,
 )
@@ -46,6 +50,7 @@ from dopt.policies import POLICIES, DOptimal
 from dopt.process import collect_rarely
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from dopt.types import CompiledFunction
 
 _optimize = CPUCodeLibrary._optimize_final_module
 _finish = CPUCodeLibrary._finalize_final_module
@@ -127,6 +132,13 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
     systems = [system() for system in SYSTEMS.values()]
     forms = [pair for form in chosen.forms for pair in form._asdict().items()]
     steps, whole = (*STEPS, *BETWEEN) if everything else STEPS[:1], (trial.trial, trial.points)
+    process = trial.trial.network, trial.trial.state.theta, trial.trial.state.posterior
+    row = process[1]
+    fits: dict[CompiledFunction, tuple[object, ...]] = {
+        thin: process,
+        refactor: process,
+        negative_evidence: (row, np.zeros((1, 1)), row, row, row),
+    }
     evaluation = {path_of(evaluate_next): partial(compiled_evaluation, *whole)}
     return {
         path_of(advance): partial(compiled_loop, *whole),
@@ -137,6 +149,11 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
         **{name_of_equations(system): partial(compiled_equations, system) for system in systems},
         **{path_of(form): partial(compile_form, trial.trial, name, form) for name, form in forms},
         **{path: partial(compiled_at, path, kinds.plan) for path in chosen.plans},
+        **{
+            path_of(fit): partial(compiled_for, path_of(fit), fit, tuple(map(kind_of, given)))
+            for fit, given in fits.items()
+            if everything
+        },
     }
 
 

@@ -75,13 +75,29 @@ class RecursiveLeastSquares(Learner):
 class Conditioning(Learner):
     """The exact posterior given every sample seen, by a factor that grows by a row a step.
 
-    It costs t² at step t in time and memory, the drawback that the paper names.
+    It costs t² at step t in time and memory, the drawback that the paper names. Where the evidence
+    chooses the kernel (:class:`dopt.models.GaussianProcess`), it is fitted again whenever the
+    number of samples has grown by a factor.
+
+    Parameters
+    ----------
+    first_rows : int
+        Samples of the first fit of the evidence.
+    growth : float
+        New samples after which another fit begins, by the samples that the last one had.
     """
 
     name: ClassVar[str] = "conditioning"
     structure: ClassVar[str] = "conditioning"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.condition"
+
+    first_rows: int = parameter(10, "samples", "positive", added=True)
+    growth: float = parameter(0.25, bound="positive", added=True)
+
+    def next_fit(self, samples: int) -> int:
+        """Return with how many samples the fit after one with so many is due; 0: the first one."""
+        return max(self.first_rows, math.ceil((1.0 + self.growth) * samples), samples + 1)
 
 
 @dataclass(frozen=True, kw_only=True)

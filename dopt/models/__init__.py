@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dopt.models.base import Model
-from dopt.models.linear import RFF, GaussianProcess, GreyBox, Linear, LinearState
+from dopt.models.gaussian_process import GaussianProcess
+from dopt.models.linear import RFF, GreyBox, Linear, LinearState
 from dopt.models.networks import MLP, AffineMLP, BlackBoxMLP, Ensemble
 
 MODELS: dict[str, type[Model]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -72,6 +73,8 @@ class ReferenceSteps:
 
     The states and the inputs are theirs to write.
     """
+
+    evidence: ClassVar[None] = None
 
     @torch.no_grad()
     def __init__(self, spec: TrialSpec) -> None:

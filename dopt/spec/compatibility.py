@@ -14,6 +14,7 @@ import functools
 import math
 from typing import NamedTuple, TypeGuard
 
+from dopt.algorithm import Score
 from dopt.errors import IncompatibleError
 from dopt.learning import (
     LEARNERS,
@@ -84,6 +85,8 @@ def held_information(
     A policy that plans by M shares it with a learner that updates it, which needs the gain in the
     space of the parameters and hence the primal form.
     """
+    if learner.structure == "conditioning":
+        return None
     sharing = learner if isinstance(learner, (InformationLearner, RecursiveLeastSquares)) else None
     noise_variance = sharing.noise_variance if isinstance(sharing, InformationLearner) else 1.0
     if isinstance(policy, InformationPolicy):
@@ -265,9 +268,13 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
         raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
     if isinstance(policy, InformationPolicy):
         _check_information(system, policy, model, learner)
-    if model.structure == "conditioning" and hasattr(policy, "regularization"):
-        expected = "a policy that needs no information matrix of parameters"
-        raise mismatch(f"model '{model.name}'", expected, given)
+    if model.structure == "conditioning" and isinstance(policy, InformationPolicy):
+        score = getattr(policy, "score", None)
+        scores = (Score.JOINT, Score.SUM, Score.TRACE)
+        if score not in scores and score not in {one.name.lower() for one in scores}:
+            expected = "a policy without an information matrix, or one that scores plans by it"
+            choices = "such as 'exact', 'trace', 'lookahead', 'icem' or 'episodic'"
+            raise mismatch(f"model '{model.name}'", f"{expected}, {choices},", given)
 
 
 def _check_unknown(system: System, model: GreyBox) -> None:
@@ -341,6 +348,17 @@ def _models(structure: str) -> str:
     return _choice("model", [name for name, one in MODELS.items() if one.structure == structure])
 
 
+def check_sampled(system: System, model: Model) -> None:
+    """Raise IncompatibleError if the record of a trial gives no samples of a state model."""
+    what, reading = "assess.sample_loss", f"model '{model.name}', which reads inputs,"
+    if model.n_inputs_read(system) or system.reads_inputs:
+        raise mismatch(what, "a model of the states alone", reading)
+    if system.n_measured:
+        raise mismatch(what, "states that are known", "states that are measured with noise", "were")
+    if getattr(system, "restarts", False):
+        raise mismatch(what, "trials in one piece", "env.restarts true")
+
+
 def mismatch(what: str, expected: str, given: str, verb: str = "was") -> IncompatibleError:
     """Return the error for two choices that do not go together."""
     return IncompatibleError(
@@ -384,7 +402,9 @@ def _matrices(
     held = held_information(policy, learner, q, r * T)
     form = held.form if held else "none"
     if isinstance(model, GaussianProcess):
-        return {"env.horizon": 2 * T**2, "env.grid_points": 2 * T * math.prod(system.grid_points)}
+        C, G = model.room(system), r if model.is_tuned else 1
+        points = 2 * G * C * math.prod(system.grid_points)
+        return {"env.horizon": 2 * G * C**2, "env.grid_points": points}
     if form == "dual" and path == "kernel":
         return {"env.horizon": (r * T) ** 2}
     if form == "sketch" and isinstance(policy, DOptimal):

@@ -15,15 +15,16 @@ from dopt.control.task import GOALS, Goal
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.evaluation import LONGEST_RUN
 from dopt.fields import Validated
-from dopt.learning import LEARNERS, InformationLearner, JointKalman, Learner
+from dopt.learning import LEARNERS, Conditioning, InformationLearner, JointKalman, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.limits import LIMITS, Limits
-from dopt.models import MODELS, Model
-from dopt.policies import POLICIES, DOptimal, GradientDOptimal, Policy, Search
+from dopt.models import MODELS, GaussianProcess, Model
+from dopt.policies import POLICIES, DOptimal, GradientDOptimal, Policy, RandomGaussian, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolicy
 from dopt.registry import TARGET, added_defaults, identifying_section, section_of
 from dopt.spec.compatibility import (
     check_reference,
+    check_sampled,
     check_together,
     memory_by_setting,
     mismatch,
@@ -118,7 +119,7 @@ class TrialConfig:
     Networks in torch run on the reference alone, most other choices in the kernel alone
     (:func:`dopt.spec.compatibility.check_reference`). ``task`` assesses the trial on
     the way, and ``limits`` bound its states and inputs; each is part of its identity only where
-    it is given.
+    it is given. So is ``sample_loss``: whether :func:`dopt.offline_fit.sample_loss` follows.
     """
 
     system: System
@@ -128,6 +129,7 @@ class TrialConfig:
     path: str = "kernel"
     task: Control | None = None
     limits: Limits | None = None
+    sample_loss: bool = False
 
     def __post_init__(self) -> None:
         if self.path not in PATHS:
@@ -162,6 +164,8 @@ class TrialConfig:
             )
         check_together(self.system, self.policy, self.model, self.learner)
         warn_of_prior(self.policy, self.model, self.learner)
+        if self.sample_loss:
+            _ = self.process
 
     def _check_estimates(self) -> None:
         """Refuse limits where nobody says how uncertain the estimated states are."""
@@ -204,6 +208,16 @@ class TrialConfig:
     def goal(self) -> Goal:
         """Goal of a policy that learns a task: from the section, or else the system's own."""
         return (self.task or Control()).on(self.system)
+
+    @functools.cached_property
+    def process(self) -> TrialConfig:
+        """Configuration with the Gaussian process that is fitted to the samples of a trial.
+
+        Raises IncompatibleError or SpecificationError if a trial does not give samples for one.
+        """
+        check_sampled(self.system, self.model)
+        model = GaussianProcess(hyperparameters="evidence")
+        return TrialConfig(self.system, RandomGaussian(), model, Conditioning())
 
     @property
     def _parts(self) -> tuple[System, Policy, Model, Learner]:
@@ -259,6 +273,8 @@ class TrialConfig:
             content["assessment_version"] = ASSESSMENT_VERSION
         if self.limits is not None:
             content["limits"] = written(self.limits)
+        if self.sample_loss:
+            content["assess"] = {"sample_loss": True}
         if self._scales_criterion():
             content["criterion_version"] = CRITERION_VERSION
         if self.system.horizon > LONGEST_RUN:

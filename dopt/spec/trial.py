@@ -32,7 +32,7 @@ from dopt.systems import System, system_from_mapping
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
 
-_KEYS = (*SECTIONS, "plant", "task", "limits", "path", "seed")
+_KEYS = (*SECTIONS, "plant", "task", "limits", "assess", "path", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,9 @@ class TrialSpec(Validated):
             one, it is the kernel where that knows all parts, and the reference elsewhere. A
             section ``task`` with a name other than "none" says how the trial is assessed, a
             section ``limits`` what its states and inputs heed (:class:`dopt.limits.Limits`), and a
-            section ``plant`` what hardware the system is behind (:func:`dopt.systems.Real`).
+            section ``plant`` what hardware the system is behind (:func:`dopt.systems.Real`). With
+            ``{"sample_loss": True}`` in a section ``assess`` it ends with the loss of a model that
+            is fitted to its samples (:func:`dopt.offline_fit.sample_loss`).
 
         Raises
         ------
@@ -102,7 +104,8 @@ class TrialSpec(Validated):
         path = given.get("path")
         path = default_path((system, policy, model, learner)) if path is None else str(path)
         optional = task_from(given.get("task")), limits_from(given.get("limits"))
-        config = TrialConfig(system, policy, model, learner, path, *optional)
+        sampled = _assesses_samples(given.get("assess"))
+        config = TrialConfig(system, policy, model, learner, path, *optional, sampled)
         return cls(config, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 
     @classmethod
@@ -258,6 +261,18 @@ def _model(section: Part) -> Model:
     from dopt.reference.models import Module
 
     return Module.from_section(section)
+
+
+def _assesses_samples(section: object) -> bool:
+    """Return whether a section ``assess`` asks for the sample loss."""
+    if section in (None, {}, {"sample_loss": False}):
+        return False
+    if section == {"sample_loss": True}:
+        return True
+    raise SpecificationError(
+        f"configuration key 'assess' is {section!r}, but a section with sample_loss, true or "
+        f"false, is expected: write for instance assess.sample_loss=true."
+    )
 
 
 def _shown(value: object) -> str:

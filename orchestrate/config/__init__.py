@@ -14,7 +14,10 @@ from dopt.registry import name_of
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 
-TRIAL_SECTIONS = ("env", "plant", "policy", "model", "learner", "task", "limits", "seed")
+TRIAL_SECTIONS = (
+    *("env", "plant", "policy", "model", "learner"),
+    *("task", "limits", "assess", "seed"),
+)
 """Sections of a configuration that define a trial."""
 
 

@@ -112,6 +112,7 @@ KNOWN = (
     "learner",
     "task",
     "limits",
+    "assess",
     "seed",
     "width",
     "launch",

@@ -149,7 +149,7 @@ TABLE_TITLES: Mapping[str, str] = {
     "trial": "one row for each trial: a configuration with a seed",
     "step": "one row for each step of each finished trial",
     "trajectory": "one row for each finished trial: its arrays",
-    "assessment": "one row for each measure of a finished trial that has a task or limits",
+    "assessment": "one row for each measure of a finished trial: of a task, limits or samples",
     "launch": "one row for each command that ran trials",
     "attempt": "one row for each run of a trial, lost runs included",
     "error": "one row for each distinct traceback",

@@ -16,7 +16,7 @@ from typing import Literal
 from orchestrate.store import database_url, packed_curves
 from orchestrate.store.errors import StoreUnavailableError
 from orchestrate.store.reader import Reader
-from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
+from orchestrate.store.schema import N_ROWS, PREQUENTIAL, SAMPLE_LOSS, STEP_VALUES
 
 Severity = Literal["error", "note"]
 _ORDER = ("error", "note")
@@ -231,11 +231,11 @@ _CONDITIONS = {
     "done trials that lack assessments": (
         f"r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
         "AND (coalesce(a.n, 0) <> coalesce(m.most, 0) "
-        """OR (a.n IS NULL AND (c.config_json LIKE '%"task":{%' """
+        """OR (coalesce(a.n, 0) = 0 AND (c.config_json LIKE '%"task":{%' """
         """OR c.config_json LIKE '%"limits":{%')))"""
     ),
     "unfinished trials with steps, a trajectory or assessments": (
-        f"NOT {_FINISHED} AND (s.n > 0 OR p.trial_id IS NOT NULL OR a.n > 0)"
+        f"NOT {_FINISHED} AND (s.n > 0 OR p.trial_id IS NOT NULL OR a.trial_id IS NOT NULL)"
     ),
     "trials with a number that is not finite, where NULL is expected": (
         f"s.infinite > 0 OR a.infinite > 0 OR {_not_finite('r', 'final_loss', 'best_loss')}"
@@ -253,13 +253,14 @@ SELECT trial_id, count(*) AS n, min(t) AS low, max(t) AS high, count(loss) AS n_
 FROM step s GROUP BY trial_id
 """
 _ASSESSMENTS = f"""
-SELECT trial_id, count(*) AS n,
+SELECT trial_id, count(*) FILTER (WHERE measure <> '{SAMPLE_LOSS}') AS n,
        sum(CASE WHEN {_not_finite("a", "value")} THEN 1 ELSE 0 END) AS infinite
 FROM assessment a GROUP BY trial_id
 """
-_EXPECTED_ASSESSMENTS = """
+_EXPECTED_ASSESSMENTS = f"""
 SELECT o.config_id, max(n) AS most
-FROM (SELECT trial_id, count(*) AS n FROM assessment GROUP BY trial_id) counted
+FROM (SELECT trial_id, count(*) AS n FROM assessment WHERE measure <> '{SAMPLE_LOSS}'
+      GROUP BY trial_id) counted
 JOIN trial o ON o.trial_id = counted.trial_id WHERE o.status = 'done' GROUP BY o.config_id
 """
 _SQL = f"""

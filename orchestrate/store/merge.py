@@ -33,6 +33,7 @@ from orchestrate.store.schema import (
     N_ROWS,
     OUTCOME_COLUMNS,
     PREQUENTIAL,
+    SAMPLE_LOSS,
     STEP_VALUES,
     assessment,
     attempt,
@@ -76,11 +77,13 @@ _ASSESSMENTS = (
     f"SELECT trial_id, t, measure, value FROM assessment WHERE {_FINISHED} "
     "ORDER BY trial_id, t, measure"
 )
-# All trials of a configuration have the same number of assessments, except explorations.
+# All trials of a configuration have the same number of assessments, except explorations, beside
+# the sample loss, which may have been stored of some alone.
 _EXPECTED = (
     "SELECT config_id, max(n) FROM (SELECT r.config_id, count(*) AS n FROM assessment a "
     "JOIN trial r ON r.trial_id = a.trial_id JOIN config c ON c.config_id = r.config_id "
     f"WHERE r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
+    f"AND a.measure <> '{SAMPLE_LOSS}' "
     "GROUP BY a.trial_id, r.config_id) AS counts GROUP BY config_id"
 )
 
@@ -188,7 +191,7 @@ class Source:
                 trial_id in trajectories
                 and len(values) == row["n_rows"]
                 and np.array_equal(values[:, 0], np.arange(len(values)))
-                and expected in (None, len(assessed))
+                and expected in (None, len(_of_all(assessed)))
             ):
                 packed = {name: _bytes(one) for name, one in trajectories[trial_id].items()}
                 curves[trial_id] = Curve(values[:, 1:], packed, assessed)
@@ -227,6 +230,11 @@ def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]
     """Return the rows without their trial_id, the first column, by which they are sorted."""
     groups = groupby(rows, key=itemgetter(0))
     return {trial_id: [row[1:] for row in group] for trial_id, group in groups}
+
+
+def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
+    """Return the assessments, (t, measure, value), that all trials of a configuration have."""
+    return [tuple(one) for one in assessments if one[1] != SAMPLE_LOSS]
 
 
 def _bytes(value: Any) -> Any:
@@ -345,7 +353,7 @@ class Target:
         ).one_or_none()
         rows = self._connection.execute(_ASSESSMENTS_HERE.where(assessment.c.trial_id == where))
         return (
-            sorted(map(tuple, rows)) == sorted(there.assessments)
+            sorted(_of_all(rows)) == sorted(_of_all(there.assessments))
             and mine.shape == there.steps.shape
             and np.array_equal(mine[:, _NUMBERS], there.steps[:, _NUMBERS], equal_nan=True)
             and arrays is not None

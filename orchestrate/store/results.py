@@ -32,6 +32,7 @@ from orchestrate.store.records import (
     DTYPE,
     Array,
     Claim,
+    Measured,
     Registrable,
     Result,
     finite,
@@ -215,15 +216,12 @@ def _trajectory_row(claim: Claim, result: Result) -> dict[str, Any]:
 
 
 def _assessment_rows(claim: Claim, result: Result) -> list[dict[str, Any]]:
-    return [
-        {
-            "trial_id": claim.trial_id,
-            "t": int(row.t),
-            "measure": row.measure,
-            "value": finite(row.value),
-        }
-        for row in result.assessments
-    ]
+    return [_assessment_row(claim.trial_id, row) for row in result.assessments]
+
+
+def _assessment_row(trial_id: int, row: Measured) -> dict[str, Any]:
+    value = finite(row.value)
+    return {"trial_id": trial_id, "t": int(row.t), "measure": row.measure, "value": value}
 
 
 def _run_row(run: RunRecord) -> dict[str, Any]:
@@ -308,6 +306,22 @@ def _error_id(connection: Connection, failure: Failure) -> int:
 def insert_error(connection: Connection, row: Mapping[str, Any]) -> int:
     """Insert a traceback unless it is there, and return its id."""
     return int(connection.execute(_INSERT_ERROR, row).scalar_one())
+
+
+def add_assessments(
+    connection: Connection, backend: Backend, measured: Mapping[str, Measured]
+) -> int:
+    """Write a measure of trials that are done, by trial key, in place of its value; count them."""
+    keys = backend.members(list(measured))
+    chosen = select(trial.c.trial_key, trial.c.trial_id)
+    done = trial.c.trial_key.in_(keys) & (trial.c.status == "done")
+    found = connection.execute(chosen.where(done).with_for_update()).all()
+    for key, trial_id in found:
+        row = _assessment_row(trial_id, measured[key])
+        same = [assessment.c[name] == row[name] for name in ("trial_id", "t", "measure")]
+        connection.execute(delete(assessment).where(*same))
+        connection.execute(_INSERT_ASSESSMENT, row)
+    return len(found)
 
 
 PAGE = 50

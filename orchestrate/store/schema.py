@@ -264,6 +264,9 @@ assessment = _table(
     rowid=False,
 )
 
+SAMPLE_LOSS = "sample_loss"
+"""Measure of the table ``assessment`` that some trials of a configuration may have alone."""
+
 attempt = _table(
     "attempt",
     _trial_key(primary_key=True),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Self
 
 from orchestrate.records import Failure, RunRecord
@@ -10,7 +10,14 @@ from orchestrate.store import database_url, launches, results, schema
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
 from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
-from orchestrate.store.records import Claim, LaunchRecord, Registrable, Registration, Result
+from orchestrate.store.records import (
+    Claim,
+    LaunchRecord,
+    Measured,
+    Registrable,
+    Registration,
+    Result,
+)
 from orchestrate.store.results import Saved
 
 
@@ -185,6 +192,15 @@ class Store:
         """Write a failed trial with its error; return False if the claim is lost."""
         with self._backend.transaction() as connection:
             return results.write_failure(connection, claim, failure, run)
+
+    def add_assessments(self, measured: Mapping[str, Measured]) -> int:
+        """Write a measure of trials that are done, by trial key, and return their number.
+
+        It takes the place of a stored value of the same step. Other trials are left as they are.
+        """
+        self.check()
+        with self._backend.transaction() as connection:
+            return results.add_assessments(connection, self._backend, measured)
 
     def written(self, claims: Sequence[Claim]) -> list[bool]:
         """Return for each claim whether its attempt has an outcome."""

@@ -440,7 +440,7 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(
     assert "choose another --out" in capsys.readouterr().err
 
 
-HELPED = ("figures", "compare", "calibration", "report", "serve")
+HELPED = ("figures", "compare", "calibration", "sample-loss", "report", "serve")
 COMMANDS = [["--help"], *([name, "--help"] for name in HELPED)]
 SERVE = ["serve"]
 PROGRAM = """

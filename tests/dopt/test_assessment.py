@@ -7,13 +7,14 @@ import itertools
 import json
 import math
 from collections import Counter
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from dopt import assessment
-from dopt.assessment import MEASURES, Plane, assess, coverage
+from dopt.assessment import MEASURES, SAMPLE_LOSS, Plane, assess, assessed, coverage
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import (
     _SEED,
     LONGEST_RUN,
@@ -24,6 +25,7 @@ from dopt.evaluation import (
 )
 from dopt.kernel import run
 from dopt.limits import VIOLATIONS, WORST
+from dopt.offline_fit import fit_offline, recorded_samples, sample_loss
 from dopt.policies import PeriodicSquare
 from dopt.result import TrialResult
 from dopt.run import rerun, run_trial
@@ -60,7 +62,7 @@ def done() -> TrialResult:
 def test_every_measure_is_there_at_every_step(done: TrialResult) -> None:
     found = [(row.t, row.measure) for row in done.assessments]
     once = ("true_model_success", "true_model_cost")
-    others = (*once, "feedback_success", "feedback_cost", VIOLATIONS, WORST)
+    others = (*once, "feedback_success", "feedback_cost", VIOLATIONS, WORST, SAMPLE_LOSS)
     often = [name for name in MEASURES if name not in others]
     expected = {(0, name) for name in once} | set(itertools.product((0, 10, 30), often))
     assert len(found) == len(set(found))
@@ -292,3 +294,58 @@ def test_a_step_too_long_for_the_system_warns_of_nothing() -> None:
 def test_no_state_within_the_limit_leaves_the_grid_alone() -> None:
     points = evaluation_set(Pendulum(state_limit=1e-9, initial_state=(1.0, 0.0)))
     assert len(points.states) == points.n_grid
+
+
+def sampled(env: str, policy: str, seed: int = 1, /, **sections: Any) -> TrialSpec:
+    """Return a trial that ends with its sample loss."""
+    mapping = trial(env, policy, seed, **sections).to_mapping()
+    return TrialSpec.from_mapping(mapping | {"assess": {"sample_loss": True}})
+
+
+def test_a_sample_loss_is_part_of_a_trial_only_where_it_is_asked_for() -> None:
+    plain = trial("pendulum", "random", 1)
+    off = TrialSpec.from_mapping(plain.to_mapping() | {"assess": {"sample_loss": False}})
+    spec = sampled("pendulum", "random")
+    assert off.trial_key == plain.trial_key != spec.trial_key
+    assert TrialSpec.from_mapping(spec.to_mapping()) == spec
+    result, without = run_trial(spec), run_trial(plain)
+    assert without.assessments == ()
+    np.testing.assert_array_equal(result.loss, without.loss)
+    (row,) = result.assessments
+    assert row == (30, SAMPLE_LOSS, sample_loss(plain, without.states, without.inputs))
+    lost = dataclasses.replace(result, diverged_at=7, assessments=())
+    assert assessed(spec, lost).assessments == ()
+
+
+def test_a_sample_loss_knows_neither_policy_nor_model_nor_learner() -> None:
+    result = run_trial(trial("cartpole", "random", 1))
+    taught = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+    specs = trial("cartpole", "d_optimal", 1, **taught), trial("cartpole", "oracle", 1)
+    losses = {sample_loss(spec, result.states, result.inputs) for spec in specs}
+    assert losses == {sample_loss(trial("cartpole", "random", 1), result.states, result.inputs)}
+
+
+def test_a_sample_loss_tells_samples_of_a_linear_system() -> None:
+    """Between the loss by least squares, which is told the form, and a network's."""
+    spec = trial("mass_spring", "random", 2, env={"horizon": 200})
+    result = run_trial(spec)
+    samples, grid = recorded_samples(spec.system, result.states, result.inputs), spec.system.grid()
+    theta = np.linalg.lstsq(samples.states, samples.accelerations, rcond=None)[0]
+    errors = grid @ theta - spec.system.learned(grid)
+    least = np.sqrt(np.mean(np.sum(errors**2, axis=1)))
+    network = fit_offline(spec, samples.states, samples.accelerations).loss
+    assert least < sample_loss(spec, result.states, result.inputs) < 0.1 * network
+
+
+def test_a_trial_without_samples_of_a_model_of_the_states_is_refused() -> None:
+    reading = {"model": {"name": "black_box"}}
+    noisy = {"env": {"measured_states": [0], "measurement_noise": [0.01]}}
+    noisy |= {"learner": {"name": "joint_ekf", "noise_variance": 0.01}}
+    for sections, words in ((reading, "which reads inputs"), (noisy, "measured with noise")):
+        with pytest.raises(IncompatibleError, match=words):
+            sampled("pendulum", "random", **sections)
+    with pytest.raises(IncompatibleError, match="which reads inputs"):
+        sampled("pendulum_unknown_gain", "random")
+    for given in ({"sample_loss": "on"}, {"sample_los": True}, True):
+        with pytest.raises(SpecificationError, match="sample_loss"):
+            TrialSpec.from_mapping(trial("pendulum", "random").to_mapping() | {"assess": given})

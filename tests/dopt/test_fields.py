@@ -53,7 +53,16 @@ strength orbit spread front_grip rear_grip turn_drag
 NONNEGATIVE = set(NONNEGATIVE_NAMES.split())
 FRACTIONS = {"beta_1", "beta_2", "discount"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states", "information", "domain", "integrator", "overshoot"}
+TEXTS = {
+    "hyperparameters",
+    "form",
+    "criterion",
+    "states",
+    "information",
+    "domain",
+    "integrator",
+    "overshoot",
+}
 LISTED_TEXTS = {"unknown"}
 OF_ANY_SIZE = {"goal", "initial"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)

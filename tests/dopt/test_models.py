@@ -18,6 +18,7 @@ from dopt.explorer import Explorer
 from dopt.kernel.learners.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS, RFF, GaussianProcess
+from dopt.models.gaussian_process import kernel
 from dopt.offline_fit import fit_offline, grid_loss, uniform_samples
 from dopt.randomness import PLANNED_DIMENSIONS, draw
 from dopt.run import rerun, run_trial
@@ -62,7 +63,8 @@ def test_random_features_have_the_kernel_in_expectation() -> None:
     frequencies = drawn[first:-first].reshape(first, 3)
     psi = model.scale * np.cos(system.featurize(states) @ frequencies.T + drawn[-first:])
     phi = system.featurize(states)
-    expected = GaussianProcess(lengthscale=0.7, amplitude=3.0).kernel(phi, phi)
+    numbers = np.array([0.7**-2] * phi.shape[1] + [9.0] + [0.0] * (phi.shape[1] + 2))
+    expected = kernel(numbers, phi, phi)
     assert psi @ psi.T == pytest.approx(expected, abs=0.15)
 
 

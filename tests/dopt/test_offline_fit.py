@@ -202,8 +202,8 @@ def test_bad_input_gets_a_sentence() -> None:
     lost = good.states.copy()
     lost[7] = np.nan
     refused(r"states hold a number that is not finite", spec, replace(good, states=lost))
-    process = trial("pendulum", "gaussian_process", 1)
-    refused(r"model 'gaussian_process' has no offline fit, but 'mlp'", process, good)
+    grey = trial("pendulum", "random", 1, model={"name": "grey_box"}, learner={"name": "ekf"})
+    refused(r"model 'grey_box' has no offline fit, but 'mlp'", grey, good)
 
 
 def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:

@@ -508,7 +508,8 @@ ARGUMENTS = {
 }
 """Arguments that the commands need beside their options."""
 
-ANALYSES = ("figures", "summary", "compare", "aggregate", "calibration", "report", "animate")
+ANALYSES = ("figures", "summary", "compare", "aggregate", "calibration", "sample-loss")
+ANALYSES += ("report", "animate")
 
 
 @pytest.fixture

@@ -2,15 +2,7 @@
 
 Recursive least squares; the extended Kalman filter, whose numbers are ρ, the forgetting factor f,
 the count of diagonal entries of M renewed at a step, what each gets back, and ζ; and conditioning
-of a Gaussian process:
-
-======  =====================================================  =====
-symbol  meaning                                                shape
-======  =====================================================  =====
-L       Cholesky factor of K + σ²/dt I of n samples            n × n
-z       L⁻¹ Y, with Y the observed accelerations               n × r
-α       L⁻ᵀ z, weights of the posterior mean                   n × r
-======  =====================================================  =====
+of a Gaussian process.
 """
 
 from __future__ import annotations
@@ -19,6 +11,7 @@ import numpy as np
 
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled
+from dopt.kernel.gaussian_process import add_sample
 from dopt.kernel.learners.adam import sampled_point
 from dopt.kernel.linear_algebra import (
     append_row,
@@ -27,14 +20,10 @@ from dopt.kernel.linear_algebra import (
     rank_update,
     settle,
     solve_columns,
-    solve_lower,
-    solve_lower_transposed,
 )
 from dopt.kernel.model import parameter_rows, sampled_state, write_jacobian
-from dopt.kernel.model_kinds import mean_weights, sample_features, write_kernel
-from dopt.kernel.network import features_at
-from dopt.kernel.structs import Covariance, Network, Plant, Posterior, Trial
-from dopt.kernel.vectors import LANES, add_multiple, inner
+from dopt.kernel.structs import Covariance, Network, Plant, Trial
+from dopt.kernel.vectors import LANES, add_multiple
 from dopt.types import Matrix, Vector
 
 
@@ -171,33 +160,6 @@ def whiten(
 
 @compiled
 def condition(trial: Trial, t: int, target: Vector) -> None:
-    """Add the sample of step t, whose accelerations are (r,): a row of L and of z, and all of α."""
-    network, posterior, r = trial.network, trial.state.posterior, target.shape[0]
-    n = posterior.n_samples[0]
-    phi = sample_features(network, trial.state.theta, r)
-    features_at(network, sampled_state(trial.plant, trial.record.states, t), phi[n])
-    write_kernel(network, phi[n], phi[:n], posterior.factor[n, :n])
-    _grow(network, posterior, target)
-    alpha = mean_weights(network, trial.state.theta, r)
-    columns = np.empty((r, n + 1))
-    columns[:] = posterior.solved[: n + 1].T
-    solve_lower_transposed(posterior.factor, n + 1, columns)
-    alpha[: n + 1] = columns.T
-
-
-@compiled
-def _grow(network: Network, posterior: Posterior, target: Vector) -> None:
-    """Turn row n of L, which holds the kernel with the n samples, into itself; add a row to z."""
-    n, process = posterior.n_samples[0], network.process
-    solve_lower(posterior.factor, n, posterior.factor[n : n + 1])
-    row = posterior.factor[n, :n]
-    # The variance of a new observation is at least the variance of its noise.
-    rest = process.amplitude * process.amplitude + process.noise_variance - inner(row, row)
-    deviation = np.sqrt(max(rest, process.noise_variance))
-    posterior.factor[n, n] = deviation
-    for k in range(target.shape[0]):
-        known = 0.0
-        for i in range(n):
-            known += row[i] * posterior.solved[i, k]
-        posterior.solved[n, k] = (target[k] - known) / deviation
-    posterior.n_samples[0] = n + 1
+    """Add the sample of step t, whose accelerations are (r,), to a Gaussian process."""
+    x = sampled_state(trial.plant, trial.record.states, t)
+    add_sample(trial.network, trial.state.theta, trial.state.posterior, x, target)

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import INVARIANT, Score
+from dopt.algorithm import INVARIANT, ModelKind, Score
+from dopt.kernel import gaussian_process as gp
 from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.linear_algebra import multiply_rows, write_dense
 from dopt.kernel.model import (
@@ -23,7 +24,7 @@ from dopt.kernel.model import (
     rows_at,
     within,
 )
-from dopt.kernel.structs import Covariance, Network, Plant, Search
+from dopt.kernel.structs import Covariance, Network, Plant, Search, State
 from dopt.kernel.vectors import add_multiple, inner, multiply, product
 from dopt.types import Booleans, Matrix, Stack, Vector
 
@@ -80,13 +81,16 @@ FEW_ROWS = 40
 class Path(NamedTuple):
     """Rows along paths that share what comes before the switch; written in place.
 
-    A path has n states whose rows count, b of them before the switch, and there are C paths.
+    A path has n states whose rows count, b of them before the switch, and there are C paths. Of a
+    Gaussian process the rows are L⁻¹k, and the products the features of the states.
     """
 
     rows: Matrix  # (R (b + C (n - b)), q), J/√ρ before the switch, then after it path by path
     products: Matrix  # of the same size, J M⁻¹
     factor: Matrix  # (R n, R n), the Cholesky factor L of I + J M⁻¹ Jᵀ of one path
     inverse: Matrix  # (q, q), M⁻¹; empty where few products are needed
+    kernels: Matrix  # numbers of Gaussian processes, (r, ·); empty in other models
+    weight: float  # by which their covariances are multiplied beside 1/ν
 
 
 class Place(NamedTuple):
@@ -97,16 +101,23 @@ class Place(NamedTuple):
 
 
 @compiled
-def new_path(plant: Plant, network: Network, search: Search, covariance: Covariance) -> Path:
+def new_path(plant: Plant, network: Network, search: Search, state: State) -> Path:
     """Return an empty path."""
-    q, R, C = covariance.size, rows_of_state(plant, network), search.candidates.shape[0]
+    covariance, q, p = state.covariance, state.covariance.size, state.covariance.size
+    kernels = np.empty((0, 0))
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        q, p = network.process.n_samples[0], network.sizes[0]
+        kernels = gp.numbers_by_row(network, state.theta, plant.learned_rows.shape[0])
+    R, C = rows_of_state(plant, network), search.candidates.shape[0]
     n, shared = search.steps // search.stride, switch_of(search) // search.stride
     starts = C if shared > 0 else 1
-    size = q if R * starts * (shared + C * (n - shared)) > FEW_ROWS else 0
+    size = covariance.size if R * starts * (shared + C * (n - shared)) > FEW_ROWS else 0
     inverse, count = np.empty((size, size)), R * (shared + C * (n - shared))
     if size > 0:
         write_dense(covariance, inverse)
-    return Path(np.empty((count, q)), np.empty((count, q)), np.zeros((R * n, R * n)), inverse)
+    weight = float(search.stride) if search.score == Score.JOINT else 1.0
+    factor = np.zeros((R * n, R * n))
+    return Path(np.empty((count, q)), np.empty((count, p)), factor, inverse, kernels, weight)
 
 
 @compiled
@@ -142,8 +153,7 @@ def add_rows(
     plant: Plant,
     network: Network,
     search: Search,
-    theta: Vector,
-    covariance: Covariance,
+    state: State,
     points: Matrix,
     path: Path,
     first: int,
@@ -153,15 +163,19 @@ def add_rows(
     They are in the units of M, for the determinant of all of them together times the root of the
     stride.
     """
+    if path.kernels.shape[0] > 0:
+        r = plant.learned_rows.shape[0]
+        gp.write_rows(network, state, r, points, path.rows[first:], path.products[first:])
+        return
     weight = search.row_scale
     if search.score == Score.JOINT:
         weight *= np.sqrt(search.stride)
     last: int = first + points.shape[0] * plant.learned_rows.shape[0]
     rows = path.rows[first:last]
-    rows[:] = rows_of_points(plant, network, theta, points)
+    rows[:] = rows_of_points(plant, network, state.theta, points)
     if weight != 1.0:
         rows *= weight
-    _apply_inverse(covariance, path, first, last)
+    _apply_inverse(state.covariance, path, first, last)
 
 
 @compiled
@@ -189,13 +203,25 @@ def log_determinant(path: Path, place: Place, first: int, last: int, block: int)
     L = path.factor
     total = 0.0
     for i in range(first, last):
-        start, products = i - i % block, path.products[row_at(place, i)]
+        start = i - i % block
         for j in range(start, i + 1):
-            value = inner(products, path.rows[row_at(place, j)])
+            value = _product_of_rows(path, place, i, j)
             value -= inner(L[i, start:j], L[j, start:j])
             L[i, j] = np.sqrt(1.0 + value) if i == j else value / L[j, j]
         total += 2.0 * np.log(L[i, i])
     return total
+
+
+@compiled
+def _product_of_rows(path: Path, place: Place, i: int, j: int) -> float:
+    """Return J M⁻¹ Jᵀ of the i-th and the j-th row of a path."""
+    a, b = row_at(place, i), row_at(place, j)
+    value: float
+    if path.kernels.shape[0] == 0:
+        value = inner(path.products[a], path.rows[b])
+    else:
+        value = path.weight * gp.information(path.kernels, path.products, path.rows, a, b)
+    return value
 
 
 @compiled
@@ -286,8 +312,7 @@ def score_of_path(score: int, path: Path, place: Place, context: ScoreContext) -
     n, total = path.factor.shape[0], 0.0
     if score == Score.TRACE:
         for i in range(n):
-            at = row_at(place, i)
-            total += inner(path.products[at], path.rows[at])
+            total += _product_of_rows(path, place, i, i)
         return total
     white = whitened(path, place)
     if score == Score.E:

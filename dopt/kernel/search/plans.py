@@ -30,7 +30,7 @@ from dopt.kernel.search.path import (
     score_of_path,
     switch_of,
 )
-from dopt.kernel.structs import Covariance, Network, Plant, Search, Trial
+from dopt.kernel.structs import Network, Plant, Search, State, Trial
 from dopt.kernel.vectors import inner
 from dopt.types import Booleans, Integers, Matrix, Vector
 
@@ -41,8 +41,7 @@ class Problem(NamedTuple):
     plant: Plant
     network: Network
     search: Search
-    theta: Vector
-    covariance: Covariance
+    state: State
     x: Vector  # (d,), the present state
     path: Path
     context: ScoreContext
@@ -61,12 +60,12 @@ class Halves(NamedTuple):
 def plan(trial: Trial, t: int, u: Vector) -> None:
     """Write the first input of the best plan that was found in time, (m,)."""
     plant, network, search = trial.plant, trial.network, trial.algorithm.search
-    theta, covariance = trial.state.theta, trial.state.covariance
+    state = trial.state
     x, tie = trial.record.states[t], trial.randomness.ties[t]
     end = monotonic_microseconds() + search.budget_us
-    path = new_path(plant, network, search, covariance)
-    context = score_context(plant, network, search, theta, covariance)
-    problem = Problem(plant, network, search, theta, covariance, x, path, context, end)
+    path = new_path(plant, network, search, state)
+    context = score_context(plant, network, search, state.theta, state.covariance)
+    problem = Problem(plant, network, search, state, x, path, context, end)
     hurried = search.budget_us > 0.0
     values = (
         _values_in_time(problem, _order(search.candidates, tie))
@@ -186,7 +185,7 @@ def _roll(problem: Problem, starts: Matrix, inputs: Matrix, first: int, last: in
     kept = np.empty((P * n * n_next_points(network), d + network.n_inputs_read))
     paths, held = paths_from(plant, network, starts), inputs.reshape(P, 1, m)
     for i in range(first, last):
-        advance_paths(plant, network, problem.theta, paths, held, 0)
+        advance_paths(plant, network, problem.state.theta, paths, held, 0)
         if (i + 1) % stride == 0:
             place = (i + 1) // stride - first // stride - 1
             keep_points(plant, network, paths, place, n, kept)
@@ -229,7 +228,7 @@ def _write_rows(problem: Problem, halves: Halves, first: int, count: int, row: i
     n = halves.points.shape[0] // halves.ends.shape[0]
     points = halves.points[first * n : (first + count) * n]
     plant, network, search = problem.plant, problem.network, problem.search
-    add_rows(plant, network, search, problem.theta, problem.covariance, points, problem.path, row)
+    add_rows(plant, network, search, problem.state, points, problem.path, row)
 
 
 @compiled

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, ModelKind, Score
+from dopt.kernel import gaussian_process as gp
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.linear_algebra import (
@@ -191,7 +192,9 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
     settings, gamma, m = settings_of(trial.algorithm.policy), trial.plant.gamma, u.shape[0]
     E, K = settings.elites, (settings.steps + settings.hold - 1) // settings.hold + 1
     memory = trial.state.policy_memory.reshape(1 + E, K, m)  # the mean, then the elites
-    definite, draws = _directions(trial, settings, t)
+    definite, draws = True, Directions(np.empty((0, 0)), np.empty((0, 0)))
+    if trial.network.kind != ModelKind.GAUSSIAN_PROCESS:
+        definite, draws = _directions(trial, settings, t)
     if not definite:
         u[:] = np.nan
         return
@@ -298,9 +301,15 @@ def _score(
     P, n, r = inputs.shape[0], settings.steps // settings.stride, plant.learned_rows.shape[0]
     inside, points = _paths(trial, settings, t, inputs)
     d, per_state = trial.record.states.shape[1], n_next_points(network)
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        _score_process(trial, settings, points, values)
+        for p in range(P):
+            values[p] = values[p] if inside[p] and np.isfinite(values[p]) else -np.inf
+        return
     changes, R = np.empty((r, draws.rows.shape[0], points.shape[0])), r * per_state
     changes_along(plant, network, theta, points, draws.rows, changes)
-    rows, factor = np.empty((n * R, draws.rows.shape[0])), np.empty((n * R, n * R))
+    rows = np.empty((n * R, draws.rows.shape[0]))
+    products, factor = np.empty((2, n * R, n * R))
     joint = settings.score in (Score.JOINT, Score.TASK)
     scale = trial.algorithm.search.row_scale * (np.sqrt(settings.stride) if joint else 1.0)
     if per_state > 1:
@@ -312,8 +321,43 @@ def _score(
             for k in range(r):
                 for j in range(rows.shape[1]):
                     rows[i * r + k, j] = weight * changes[k, j, place]
-        value = score_of_rows(settings.score, rows, draws.exact, R, factor)
+        _write_products(settings.score, rows, R, products)
+        value = score_of_rows(settings.score, products, rows, draws.exact, R, factor)
         values[p] = value if inside[p] and np.isfinite(value) else -np.inf
+
+
+@compiled
+def _write_products(score: int, rows: Matrix, r: int, out: Matrix) -> None:
+    """Write the products that a score needs of rows, (N, ·), below the diagonal of (N, N)."""
+    for i in range(rows.shape[0]):
+        start = i if score == Score.TRACE else (i - i % r if score == Score.SUM else 0)
+        for j in range(start, i + 1):
+            out[i, j] = inner(rows[i], rows[j])
+
+
+@compiled
+def _score_process(trial: Trial, settings: Settings, points: Matrix, values: Vector) -> None:
+    """Write the scores of paths, (P,), with a Gaussian process; points, (P n, d), path by path."""
+    network, state, P = trial.network, trial.state, values.shape[0]
+    r, n, joint = trial.plant.learned_rows.shape[0], points.shape[0] // P, Score.JOINT
+    N, weight = n * r, float(settings.stride) if settings.score == joint else 1.0
+    white = np.empty((P * N, network.process.n_samples[0]))
+    features = np.empty((P * N, network.sizes[0]))
+    gp.write_rows(network, state, r, points, white, features)
+    numbers = gp.numbers_by_row(network, state.theta, r)
+    products, factor, nothing = np.zeros((N, N)), np.empty((N, N)), np.empty((0, 0))
+    counted = np.empty(P * n)
+    for i in range(P * n):
+        counted[i] = 1.0 if domain_weight(trial.algorithm.search.domain, points[i]) == 1.0 else 0.0
+    for p in range(P):
+        for i in range(N):
+            for j in range(i % r, i + 1, r):
+                a, b = p * N + i, p * N + j
+                both = weight * counted[a // r] * counted[b // r]
+                products[i, j] = 0.0
+                if both > 0.0:
+                    products[i, j] = both * gp.information(numbers, features, white, a, b)
+        values[p] = score_of_rows(settings.score, products, nothing, nothing, r, factor)
 
 
 @compiled
@@ -352,23 +396,25 @@ def domain_weight(domain: Matrix, x: Vector) -> float:
 
 
 @compiled
-def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matrix) -> float:
-    """Return the score of a path from J W, (N, g + s), r rows for each state.
+def score_of_rows(
+    score: int, products: Matrix, rows: Matrix, exact: Matrix, r: int, factor: Matrix
+) -> float:
+    """Return the score of a path from J M⁻¹ Jᵀ, (N, N), and J W, (N, g + s), r rows for each state.
 
     It is the mean over the horizons that end at one of the states: what the i-th of n states adds
     counts (n - i) / n times, i from 0. ``factor``, (N, N), is overwritten by the Cholesky factor L
     of I + J M⁻¹ Jᵀ, and the exact products in ``rows`` by L⁻¹ times them.
     """
-    N, g, total = rows.shape[0], exact.shape[0], 0.0
+    N, g, total = factor.shape[0], exact.shape[0], 0.0
     block = r if score == Score.SUM else N
     for i in range(N):
         share = 1.0 - (i // r) / (N // r)
         if score == Score.TRACE:
-            total += share * inner(rows[i], rows[i])
+            total += share * products[i, i]
             continue
         start = i - i % block
         for j in range(start, i + 1):
-            value = inner(rows[i], rows[j]) - inner(factor[i, start:j], factor[j, start:j])
+            value = products[i, j] - inner(factor[i, start:j], factor[j, start:j])
             factor[i, j] = np.sqrt(1.0 + value) if i == j else value / factor[j, j]
         total += share * 2.0 * np.log(factor[i, i])
     if score != Score.TASK:

@@ -238,7 +238,7 @@ def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
 
 def test_memory_counts_the_features_at_the_evaluation_points() -> None:
     spec = features("pendulum", env={"grid_points": [64, 64]}, model={"n_features": 200})
-    points = points_of_trial(shared_points(spec.config), KernelTrial(spec).trial.network, 9)
+    points = points_of_trial(shared_points(spec.config), KernelTrial(spec).trial.network)
     q = 200
     assert spec.config.memory >= points.basis.nbytes + 8 * q**2
     assert spec.config.largest_setting == "model.n_features"

@@ -53,7 +53,7 @@ def test_the_entropy_of_no_candidate_is_larger(env: str, lookahead: int) -> None
     for t in (1, 5, 13):
         process, values = Conditioned(spec, run, t), []
         alpha = spec.system.horizon * len(spec.system.features)
-        weights = run.parameters[t][alpha:].reshape(spec.system.horizon, -1)
+        weights = run.parameters[t][alpha:].reshape(-1, spec.system.horizon).T
         size = np.abs(process.weights).max()
         assert weights[:t] == pytest.approx(process.weights, abs=1e-7 * size)
         for u in candidates:

@@ -211,6 +211,7 @@ TRIAL = ("env.horizon=5", "executor=inprocess")
         ["launch.memory_gib=1.5"],
         ["launch.memory_gib=2", "launch.retry_memory=1.5"],
         ["launch.lease=20", "launch.patience=10.5"],
+        ["assess.sample_loss=true"],
     ],
     ids=" ".join,
 )
@@ -231,6 +232,7 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.memory_gib=0", "launch.memory_gib is 0, but null or a number of GiB above 0"),
         ("launch.retry_memory=2", "launch.retry_memory is 2, but there is no limit that it could"),
         ("launch.lease=null", "launch.lease"),
+        ("assess.sample_loss=yes please", "'assess' is {'sample_loss': 'yes please'}, but"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
         ("launch.patience=60", "launch.patience is 60, but less than launch.lease=60 is expected"),
     ],

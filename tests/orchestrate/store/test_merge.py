@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
+from dopt.result import Assessment
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import (
@@ -26,6 +27,7 @@ from orchestrate.store import (
 )
 from orchestrate.store import merge as source
 from orchestrate.store import schema as schema_version
+from orchestrate.store.doctor import examine
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.schema import metadata
 from tests.orchestrate.store.conftest import each_other
@@ -305,6 +307,20 @@ def test_another_assessment_is_a_conflict(url: str, other: str) -> None:
         assess(where, Spec(0))
     execute(other, "UPDATE assessment SET value = 9 WHERE t = 3")
     assert [one.seed for one in merge(url, other).conflicts] == [0]
+
+
+def test_a_sample_loss_may_be_stored_of_some_trials_alone(url: str, other: str) -> None:
+    assess(other, Spec(0), Spec(1))
+    found = {Spec(0).trial_key: Assessment(7, schema_version.SAMPLE_LOSS, 0.5)}
+    with Store.open(other) as store:
+        assert store.add_assessments(found) == 1
+    assert not any("assessments" in one.sentence for one in examine(other))
+    assert merge(url, other).added == {"done": 2}
+    assert everything(url) == everything(other)
+    with Store.open(other) as store:
+        store.add_assessments({Spec(1).trial_key: Assessment(7, schema_version.SAMPLE_LOSS, 2.0)})
+    again = merge(url, other)
+    assert (again.identical, again.conflicts) == (2, [])
 
 
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n"

@@ -404,6 +404,22 @@ def first_steps(n: int) -> FakeResult:
     return replace(whole, **cut, states=whole.states[: n + 1], n_steps=n, final_loss=final)
 
 
+def test_a_measure_is_added_to_trials_that_are_done_in_place_of_its_value(
+    store: Store, take: Take, reader: Reader
+) -> None:
+    done, lost, _ = take(*(Spec(seed) for seed in range(3)))
+    store.commit(done, assessed(), RUN)
+    store.commit(lost, diverged(3), RUN)
+    keys = [Spec(seed).trial_key for seed in range(3)]
+    before = reader.assessments(Spec().config_key, "cost").values
+    for value in (1.5, 0.25):
+        assert store.add_assessments({key: Assessment(7, "added", value) for key in keys}) == 1
+        found = reader.assessments(Spec().config_key, "added")
+        assert (found.seeds.tolist(), found.t.tolist()) == ([0], [7])
+        assert found.values == value
+    np.testing.assert_array_equal(reader.assessments(Spec().config_key, "cost").values, before)
+
+
 @given(arrays.arrays(np.float64, arrays.array_shapes(min_dims=1, max_dims=2, min_side=0)))
 def test_packed_arrays_come_back_bit_for_bit(array: Array) -> None:
     shape, data = pack(array)

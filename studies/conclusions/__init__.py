@@ -1,0 +1,1 @@
+"""Which sentences of the paper hold, under which learner, on which plant."""

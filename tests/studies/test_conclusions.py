@@ -1,0 +1,108 @@
+"""Rows about the paper's sentences, the tables that follow from them, and what the page says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
+from dopt.systems.properties import eigenmode
+from studies.conclusions import tables, trials
+from studies.conclusions.__main__ import complete, main
+from studies.conclusions.trials import Cell, Row
+from tests.pages import DOCS
+
+KEYS = tables.KEYS
+
+
+def losses(*cell: str) -> pd.Series[float]:
+    return tables.losses(tables.read(), *cell)
+
+
+def geometric(values: pd.Series[float]) -> float:
+    return float(np.exp(np.log(values).mean()))
+
+
+def test_the_page_has_the_tables_of_its_rows() -> None:
+    page = (DOCS / "conclusions.md").read_text()
+    for made in tables.TABLES[1:]:
+        assert f"<!-- table: {made.__name__} -->\n{made()}<!-- end -->" in page
+
+
+def test_the_headlines_have_a_hundred_seeds_that_nothing_was_tuned_on() -> None:
+    for env in trials.BEST:
+        found = losses(env, "ideal", "best", "evidence")
+        assert sorted(found.index) == list(range(200, 300))
+    for learner in ("adam_window", "evidence"):
+        for env in trials.SYSTEMS:
+            assert len(losses(env, "ideal", "d_optimal", learner)) == 100
+
+
+def test_the_sentences_of_the_page() -> None:
+    oracle = losses("pendulum", "ideal", "oracle", "least_squares")
+    best = losses("pendulum", "ideal", "best", "evidence")
+    assert 3.0 < geometric(best / oracle) < 4.0
+    assert (best < oracle).sum() <= 5
+    arm = [losses("arm", "ideal", one, "evidence") for one in ("uniform", "d_optimal")]
+    assert geometric(arm[0] / arm[1]) < 0.8
+    rows = tables.read()
+    share = tables.losses(rows, "cartpole", "ideal", "d_optimal", "adam_window", column="resonant")
+    assert share.mean() == pytest.approx(0.14, abs=0.005)
+
+
+@pytest.mark.parametrize("plant", ["ideal", *trials.PLANTS])
+def test_every_cell_is_a_trial(plant: str) -> None:
+    cells = [one for group in trials.cells() for one in group if one.plant == plant]
+    assert cells
+    for cell in cells:
+        assert isinstance(cell.spec(0), TrialSpec)
+
+
+def test_the_extent_of_states() -> None:
+    system = SYSTEMS["pendulum"]()
+    half = np.array(system.grid_half_widths)
+    rng = np.random.default_rng(0)
+    dense = rng.uniform(-1, 1, (20_000, 2)) * half
+    width, gap = trials._extent(system, dense)
+    assert width == pytest.approx(3**-0.5, rel=0.02)
+    assert gap < 0.02
+    _, far = trials._extent(system, np.zeros((5, 2)))
+    assert far == pytest.approx(0.765, rel=0.02)  # mean distance from the centre of a square
+
+
+def test_the_power_near_the_eigenfrequency() -> None:
+    system = SYSTEMS["pendulum"]()
+    time = system.dt * np.arange(500)[:, None]
+    mode = eigenmode(system)
+    assert mode is not None
+    assert trials._resonant(system, np.sin(mode.frequency * time)) > 0.9
+    assert trials._resonant(system, np.sin(3.0 * mode.frequency * time)) < 0.05
+
+
+def test_missing_trials_are_run_and_appended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = Cell("pendulum", "ideal", "random", "adam_window")
+    monkeypatch.setattr("studies.conclusions.__main__.SEEDS", (0, 2))
+    monkeypatch.setattr("studies.conclusions.__main__.cells", lambda: [[cell]])
+    path = tmp_path / "rows.csv"
+    complete(path)
+    first = pd.read_csv(path)
+    assert list(first.columns) == [*KEYS, "seed", *Row._fields]
+    assert first.seed.tolist() == [0, 1]
+    assert np.isfinite(first[list(Row._fields)]).all(axis=None)
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
+    complete(path)
+    assert pd.read_csv(path).equals(first.drop(columns=[]).assign(**_times(path)))
+    main(["--rows", str(path)])
+    assert "| inputs, learner |" in capsys.readouterr().out
+
+
+def _times(path: Path) -> dict[str, pd.Series[float]]:
+    """Return the times of a file of rows, which differ from run to run."""
+    rows = pd.read_csv(path)
+    return {name: rows[name] for name in ("step_ms", "worst_ms")}
