@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 
 from dopt.kernel.gaussian_process import negative_evidence, refactor, thin
 from dopt.kernel.pointers import compiled_for, kind_of, path_of
@@ -71,6 +69,8 @@ def fit_numbers(
     most_steps : int
         Most iterations of a fit.
     """
+    from scipy.optimize import minimize  # whose import takes long
+
     p, guess = len(phi), np.log(guessed(phi, y))
     spread = np.repeat(SPREADS, (p, 1, p, 1, 1))
     free = np.arange(2 * p + (3 if noise is None else 2))
@@ -158,6 +158,8 @@ def fit_process(
     seed : int
         Seed of the trial, from which the random numbers come.
     """
+    from scipy.linalg import cho_factor, cho_solve
+
     rng, C = stream(seed, "evidence"), model.room(system)
     chosen = evenly(len(states), C)
     phi, targets = system.featurize(states[chosen]).T.copy(), accelerations[chosen].T.copy()
