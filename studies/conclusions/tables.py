@@ -56,7 +56,8 @@ def ratio_text(these: pd.Series[float], others: pd.Series[float]) -> str:
 
 
 def markdown(head: list[str], body: list[list[str]]) -> str:
-    lines = [f"| {' | '.join(line)} |\n" for line in (head, *body)]
+    shown = (line for line in body if set(line[1:]) != {"–"})  # some trials were not run yet
+    lines = [f"| {' | '.join(line)} |\n" for line in (head, *shown)]
     return "".join([lines[0], f"|{'---|' * len(head)}\n", *lines[1:]])
 
 
