@@ -1,4 +1,4 @@
-"""Which stored configuration stands for a policy in an environment.
+"""Choice of the stored configuration that stands for a policy in an environment.
 
 A database may hold the paper's grid beside other widths, bounds and learners. A picture compares
 policies under one setting of an environment: its env, model, learner and limits. A setting with the

@@ -37,7 +37,7 @@ from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
 from dopt.explorer.refit import Found, Recording
 from dopt.explorer.signs import Signs
-from dopt.learning import Conditioning, SimulationError
+from dopt.learning import SimulationError
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.scaled import scaled, scaled_trial
@@ -271,10 +271,10 @@ class ExplorerState:
         follows = self.present is not None and self.done < self.spec.system.horizon
         whole = is_event(event, len(self._measured), self.spec.system.n_inputs)
         if "refit" in event:
+            evidence, fits = self.steps.evidence, isinstance(self.spec.learner, SimulationError)
             sizes = len(self.steps.parameters), len(self.system.parameters) + 2
-            if self.steps.evidence is not None:
-                sizes = self.steps.evidence.numbers.size, 0
-            fits = isinstance(self.spec.learner, SimulationError | Conditioning)
+            if evidence is not None:
+                fits, sizes = True, (evidence.numbers.size, 0)
             whole &= fits and (len(event["refit"]), len(event["fitted"])) == sizes
         return whole and (follows or not needs_state)
 

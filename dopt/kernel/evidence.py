@@ -36,6 +36,25 @@ FARTHEST = 6.0
 """Bounds of the logarithms, in their standard deviations."""
 
 
+MOST_STEPS = 30
+"""Iterations of a fit in a trial."""
+
+FEW = 150
+"""Samples of the first part of a fit."""
+
+MANY = 500
+"""Samples of its second part: its time grows with their cube."""
+
+MOST = 20
+"""Iterations of its second part."""
+
+FITS_WITH_RESTARTS = 4
+"""First fits, of few samples, that also start from guesses."""
+
+MOST_FITTED = 1000
+"""Most samples of a fit; of more it takes an even choice."""
+
+
 def guessed(phi: Array, y: Array) -> Array:
     """Return the guess of the numbers, (2p + 3,), for features (p, n) and accelerations (n,)."""
     size = float(np.mean(y**2)) or 1.0
@@ -136,10 +155,6 @@ def fit_rows(request: Request) -> Array:
     return np.array([fit_numbers(phi, y, counts, at, noise, MOST_STEPS) for y, at in rows])
 
 
-MOST_STEPS = 30
-"""Iterations of a fit in a trial."""
-
-
 def fit_process(
     model: GaussianProcess, system: System, states: Array, accelerations: Array, seed: int
 ) -> Array:
@@ -183,32 +198,14 @@ def fit_process(
     return parameters
 
 
-FEW = 150
-"""Samples of the first part of a fit."""
-
-MANY = 500
-"""Samples of its second part: its time grows with their cube."""
-
-MOST = 20
-"""Iterations of its second part."""
-
-
 def evenly(count: int, most: int) -> Integers:
     """Return at most so many places of a number of samples, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-FITS_WITH_RESTARTS = 4
-"""First fits, of few samples, that also start from guesses."""
-
-
 def is_tuned(model: Model) -> TypeGuard[GaussianProcess]:
     """Return True if the evidence chooses the kernels of a model."""
     return isinstance(model, GaussianProcess) and model.is_tuned
-
-
-MOST_FITTED = 1000
-"""Most samples of a fit; of more it takes an even choice."""
 
 
 class Evidence:
@@ -246,18 +243,24 @@ class Evidence:
             starts = np.concatenate([*([starts] if self._done else []), guesses, drawn], axis=1)
         return Request(phi, targets, state.posterior.counts[chosen], starts, self._noise)
 
-    def take(self, numbers: Array, samples: int) -> None:
-        """Let the numbers of a fit after so many steps come into force."""
-        self._call(thin)
-        self.numbers[:] = numbers
-        self._call(refactor)
-        self._done += 1
-        self.due = self._learner.next_fit(samples)
+    def take(self, numbers: Array, steps: int) -> None:
+        """Let the numbers of a fit after so many steps come into force.
 
-    def _call(self, function: CompiledFunction) -> None:
+        The present ones stay where rounding leaves K + νI indefinite with the new ones.
+        """
+        self._call(thin)
+        before = self.numbers.copy()
+        self.numbers[:] = numbers
+        if not self._call(refactor):
+            self.numbers[:] = before
+            self._call(refactor)
+        self._done += 1
+        self.due = self._learner.next_fit(steps)
+
+    def _call(self, function: CompiledFunction) -> Any:
         network, state = self._trial.network, self._trial.state
         given = network, state.theta, state.posterior
-        compiled_for(path_of(function), function, tuple(map(kind_of, given)))(*given)
+        return compiled_for(path_of(function), function, tuple(map(kind_of, given)))(*given)
 
     def fit(self, points: Evaluation) -> float:
         """Fit the kernels, with as many samples as were due; return the time that it took [µs]."""

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.compiler import called_from_python, compiled, copy_into, power_of_two, squared
+from dopt.kernel.compiler import called_from_python, compiled, copy_into, squared
 from dopt.kernel.linear_algebra import (
     factorize,
     solve_columns,
@@ -35,10 +35,10 @@ from dopt.kernel.linear_algebra import (
     solve_lower_transposed,
     write_inverse,
 )
-from dopt.kernel.network import LN2_HIGH, LN2_LOW, LOG2_E, ROUND, C, features_at
+from dopt.kernel.network import exp_parts, features_at
 from dopt.kernel.structs import Evaluation, Network, Posterior, State
 from dopt.kernel.vectors import add_multiple, inner, multiply_add
-from dopt.types import Matrix, Vector
+from dopt.types import Integers, Matrix, Vector
 
 LITTLE = 0.1
 """Variance of what a sample shows, in units of its noise, below which it adds little."""
@@ -50,15 +50,7 @@ SMALLEST_EXPONENT = -700.0
 @compiled
 def exp_of_negative(x: float) -> float:
     """Return exp(x) for x ≤ 0, in operations that the compiler turns into vector instructions."""
-    y = SMALLEST_EXPONENT if x < SMALLEST_EXPONENT else x
-    shifted = multiply_add(y, LOG2_E, ROUND)
-    k = shifted - ROUND
-    r = multiply_add(k, -LN2_LOW, multiply_add(k, -LN2_HIGH, y))
-    p = C[13]
-    for n in (12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2):
-        p = multiply_add(p, r, C[n])
-    p = multiply_add(p * r, r, r)
-    power: float = power_of_two(shifted)
+    power, p = exp_parts(SMALLEST_EXPONENT if x < SMALLEST_EXPONENT else x)
     value: float = multiply_add(power, p, power)
     return value
 
@@ -207,14 +199,8 @@ def _merge(
     """
     n, r, p = network.process.n_samples[0], target.shape[0], phi.shape[0]
     numbers, others = numbers_of(network, theta, r), sample_features(network, theta)
-    nearest, least, row = 0, np.inf, np.empty(n)
+    nearest, row = _nearest(numbers, phi, others, np.arange(n)), np.empty(n)
     here, there, at = np.empty(r), np.empty(r), np.empty(p)
-    for i in range(n):
-        square = 0.0
-        for j in range(p):
-            square += numbers[:, j].sum() * squared(others[j, i] - phi[j])
-        if square < least:
-            nearest, least = i, square
     for j in range(p):
         at[j] = others[j, nearest]
     write_mean_at(network, theta, phi, row, here)
@@ -224,6 +210,19 @@ def _merge(
         mean = posterior.targets[k, nearest]
         posterior.targets[k, nearest] += (target[k] - here[k] + there[k] - mean) / (count + 1.0)
     posterior.counts[nearest] = count + 1.0
+
+
+@compiled
+def _nearest(numbers: Matrix, phi: Vector, others: Matrix, places: Integers) -> int:
+    """Return which of some columns of (p, ·) is nearest to features (p,), by the sum of all w."""
+    nearest, least = places[0], np.inf
+    for place in places:
+        square = 0.0
+        for j in range(phi.shape[0]):
+            square += numbers[:, j].sum() * squared(others[j, place] - phi[j])
+        if square < least:
+            nearest, least = place, square
+    return int(nearest)
 
 
 @called_from_python
@@ -272,13 +271,9 @@ def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
     for i in range(n):
         if taken[i]:
             continue
-        nearest, least = chosen[0], np.inf
-        for one in chosen[:m]:
-            square = 0.0
-            for j in range(p):
-                square += numbers[:, j].sum() * squared(phi[j, one] - phi[j, i])
-            if square < least:
-                nearest, least = one, square
+        for j in range(p):
+            at[j] = phi[j, i]
+        nearest = _nearest(numbers, at, phi, chosen[:m])
         share = posterior.counts[i] / (posterior.counts[nearest] + posterior.counts[i])
         for k in range(r):
             moved = targets[k, i] - means[k, i] + means[k, nearest]

@@ -64,10 +64,8 @@ def _tanh(x: NumbaType) -> NumbaType:
 
 
 @compiled
-def _tanh_double(x: float) -> float:
-    size = abs(x)
-    size = SATURATION if size > SATURATION else size
-    y = -2.0 * size
+def exp_parts(y: float) -> tuple[float, float]:
+    """Return 2^k and p with exp(y) = 2^k (1 + p), for |y| up to 700."""
     shifted = multiply_add(y, LOG2_E, ROUND)
     k = shifted - ROUND
     r = multiply_add(k, -LN2_LOW, multiply_add(k, -LN2_HIGH, y))
@@ -76,6 +74,14 @@ def _tanh_double(x: float) -> float:
         p = multiply_add(p, r, C[n])
     p = multiply_add(p * r, r, r)
     power: float = power_of_two(shifted)
+    return power, p
+
+
+@compiled
+def _tanh_double(x: float) -> float:
+    size = abs(x)
+    size = SATURATION if size > SATURATION else size
+    power, p = exp_parts(-2.0 * size)
     e: float = multiply_add(power, p, power - 1.0)
     value = -e / (2.0 + e)
     return value if x >= 0.0 else -value

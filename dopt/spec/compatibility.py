@@ -14,7 +14,6 @@ import functools
 import math
 from typing import NamedTuple, TypeGuard
 
-from dopt.algorithm import Score
 from dopt.errors import IncompatibleError
 from dopt.learning import (
     LEARNERS,
@@ -269,9 +268,8 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if isinstance(policy, InformationPolicy):
         _check_information(system, policy, model, learner)
     if model.structure == "conditioning" and isinstance(policy, InformationPolicy):
-        score = getattr(policy, "score", None)
-        scores = (Score.JOINT, Score.SUM, Score.TRACE)
-        if score not in scores and score not in {one.name.lower() for one in scores}:
+        score = getattr(policy, "score", None)  # a name, or its code
+        if str(getattr(score, "name", score)).lower() not in ("joint", "sum", "trace"):
             expected = "a policy without an information matrix, or one that scores plans by it"
             choices = "such as 'exact', 'trace', 'lookahead', 'icem' or 'episodic'"
             raise mismatch(f"model '{model.name}'", f"{expected}, {choices},", given)

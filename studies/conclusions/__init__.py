@@ -1,1 +1,1 @@
-"""Which sentences of the paper hold, under which learner, on which plant."""
+"""Verdicts on the sentences of the paper, by learner and plant."""

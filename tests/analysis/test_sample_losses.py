@@ -1,4 +1,4 @@
-"""What a policy collected, beside what its learner made of it."""
+"""Sample losses: what a policy collected, beside what its learner made of it."""
 
 from __future__ import annotations
 

@@ -166,6 +166,18 @@ def test_what_adds_little_is_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one.record.loss[299] < 2.0 * whole.loss[299]
 
 
+def test_numbers_that_leave_the_matrix_indefinite_do_not_come_into_force() -> None:
+    one = trial_in_kernel(tuned("cartpole", "random", 1))
+    one.advance(30)
+    assert one.evidence is not None
+    before, parameters = one.evidence.numbers.copy(), one.parameters.copy()
+    wrong = before.copy()
+    wrong[:, -1] = -2.0 * before.max()  # no noise has such a variance
+    one.evidence.take(wrong, 30)
+    assert np.array_equal(one.evidence.numbers, before)
+    assert one.parameters == pytest.approx(parameters, rel=1e-6, abs=1e-6 * parameters.max())
+
+
 def test_fits_take_an_even_choice() -> None:
     assert evenly(5, 9).tolist() == [0, 1, 2, 3, 4]
     assert evenly(1001, 5).tolist() == [0, 250, 500, 750, 1000]
