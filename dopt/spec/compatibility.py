@@ -269,10 +269,14 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
         _check_information(system, policy, model, learner)
     if model.structure == "conditioning" and isinstance(policy, InformationPolicy):
         score = getattr(policy, "score", None)  # a name, or its code
-        if str(getattr(score, "name", score)).lower() not in ("joint", "sum", "trace"):
-            expected = "a policy without an information matrix, or one that scores plans by it"
-            choices = "such as 'exact', 'trace', 'lookahead', 'icem' or 'episodic'"
-            raise mismatch(f"model '{model.name}'", f"{expected}, {choices},", given)
+        name = str(getattr(score, "name", score)).lower()
+        if name not in ("joint", "sum", "trace"):
+            expected = (
+                "a policy without an information matrix of parameters, or one that compares plans "
+                "by 'joint', 'sum' or 'variance' ('exact', 'trace', 'lookahead', 'icem', 'episodic')"
+            )
+            shown = given if score is None else f"{given} with the criterion '{name}'"
+            raise mismatch(f"model '{model.name}'", expected, shown)
 
 
 def _check_unknown(system: System, model: GreyBox) -> None:
