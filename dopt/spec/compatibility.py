@@ -272,8 +272,9 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
         name = str(getattr(score, "name", score)).lower()
         if name not in ("joint", "sum", "trace"):
             expected = (
-                "a policy without an information matrix of parameters, or one that compares plans "
-                "by 'joint', 'sum' or 'variance' ('exact', 'trace', 'lookahead', 'icem', 'episodic')"
+                "a policy without an information matrix of parameters, or one that compares "
+                "plans by 'joint', 'sum' or 'variance' ('exact', 'trace', 'lookahead', 'icem', "
+                "'episodic')"
             )
             shown = given if score is None else f"{given} with the criterion '{name}'"
             raise mismatch(f"model '{model.name}'", expected, shown)
