@@ -1,4 +1,4 @@
-"""Limits of a robot's joints: from a file, or from the robot's own, with what looks wrong in them."""
+"""Limits of a robot's joints, from files, with what looks wrong in them."""
 
 from __future__ import annotations
 
