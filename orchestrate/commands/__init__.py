@@ -5,7 +5,7 @@ A new command is a :class:`~orchestrate.commands.command.Command` and a line in 
 
 from __future__ import annotations
 
-from orchestrate.commands import export, maintenance, results, status
+from orchestrate.commands import design, export, maintenance, results, status
 from orchestrate.commands.command import Command
 
 COMMANDS: tuple[Command, ...] = (
@@ -21,5 +21,6 @@ COMMANDS: tuple[Command, ...] = (
     maintenance.BACKUP_COMMAND,
     maintenance.PRUNE_COMMAND,
     maintenance.VACUUM_COMMAND,
+    design.DESIGN_COMMAND,
 )
 """In the order in which the help shows them."""
