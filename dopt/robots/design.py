@@ -2,9 +2,9 @@
 
 The criterion is D_s: the log determinant of the covariance of the requested parameters, in relative
 units, with a prior standard deviation of 1 for every parameter; what is unknown and not requested
-counts as such. A penalty keeps every error near or below its median over random multisines. The bound is by
-J. Kiefer and J. Wolfowitz, "The equivalence of two extremum problems", Can. J. Math. 12 (1960): no
-motion has more information than the best measure over all states within the limits.
+counts as such. A penalty keeps every error near or below its median over random multisines. The
+bound is by J. Kiefer and J. Wolfowitz, "The equivalence of two extremum problems", Can. J. Math. 12
+(1960): no motion has more information than the best measure over all states within the limits.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PERIODS = (2.0, 5.0, 10.0, 20.0)
 """Periods of the Fourier series that are tried [s]."""
 
 BEGUN, CHANGED, KEPT = 24, (0.03, 0.1, 0.3), 0.7
-"""Motions from which a search begins, shares of the numbers that it changes, and their correlation."""
+"""Motions that begin a search, shares of the numbers that it changes, and their correlation."""
 
 ABOVE = 1.1
 """Error by its reference above which a penalty begins."""
@@ -149,31 +149,31 @@ class Problem:
         worst = math.log(float(np.max(self.errors(information) / self.reference)) / ABOVE)
         return -0.5 * self.determinant(information) / self.count + FLOOR * max(worst, 0.0)
 
-    def within(self, family: Family, numbers: Array) -> tuple[Motion, float, float]:
-        """Return a motion within the torques, its reach, and by how much it breaks limits."""
-        reach = 1.0
-        for _ in range(6):
-            motion = family.motion(numbers, COARSE, reach)
-            strain = self.strain(motion)
-            if strain <= 1.0:
-                break
-            reach *= max(0.6, 0.98 / math.sqrt(strain))
-        touching = {row for row, _, _ in self.body.collisions(motion.positions[::5])}
-        share = len(touching) / max(1, len(motion.positions[::5]))
-        return motion, reach, max(strain - 1.0, 0.0) + (0.5 + share if touching else 0.0)
-
-    def strain(self, motion: Motion) -> float:
+    def strain(self, motion: Motion, rigid: Array | None = None) -> float:
         """Return the largest share of the limits of torque, friction included."""
         friction = self._friction * np.tanh(motion.velocities / (0.01 * self.limits.velocity))
-        torques = self.body.torques(motion) + friction
+        torques = self.body.torques(motion, rigid) + friction
         return float(np.abs(torques / self.limits.torque).max())
 
     def candidate(self, family: Family, numbers: Array) -> Candidate:
-        """Return a motion with its score, before its share is known."""
-        motion, reach, broken = self.within(family, numbers)
-        information = self.information(motion)
-        score = self.score(information) + 10.0 * broken
-        errors = self.errors(information)
+        """Return a motion with its score; its share is not known yet.
+
+        It reaches as far as the torques allow, and has a penalty where bodies touch.
+        """
+        reach = 1.0
+        for _ in range(6):
+            motion = family.motion(numbers, COARSE, reach)
+            rigid = self.body.regressor(motion)
+            strain = self.strain(motion, rigid)
+            if strain <= 1.0:
+                break
+            reach *= max(0.6, 0.98 / math.sqrt(strain))
+        looked = motion.positions[:: round(0.2 / COARSE)]
+        touching = {row for row, _, _ in self.body.collisions(looked)}
+        broken = max(strain - 1.0, 0.0)
+        broken += 0.5 + len(touching) / len(looked) if touching else 0.0
+        information = self.unknowns.information(motion, self.rate, rigid)
+        score, errors = self.score(information) + 10.0 * broken, self.errors(information)
         return Candidate(family.name, family, numbers, reach, score, errors, 0.0, broken == 0.0)
 
 

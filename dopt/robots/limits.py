@@ -174,7 +174,7 @@ def _given(body: Body, file: Path) -> dict[tuple[str, str], Any]:
     return given
 
 
-def _checked(source: Path, what: str, value: object, is_range: bool) -> Any:
+def _checked(source: Path, what: str, value: Any, is_range: bool) -> Any:
     """Return a positive number, or a range [low, high]; a number is the range about 0."""
     if is_range and isinstance(value, int | float) and not isinstance(value, bool):
         value = [-abs(value), abs(value)]

@@ -199,14 +199,17 @@ class Unknowns:
         torques = self.body.torques(Motion(1.0, home, still, pushed))
         return float(torques[1, k] - torques[0, k])
 
-    def regressor(self, motion: Motion) -> Array:
-        """Return ∂τ/∂p in relative units, (T, n, p): torque for a parameter off by its scale."""
+    def regressor(self, motion: Motion, rigid: Array | None = None) -> Array:
+        """Return ∂τ/∂p in relative units, (T, n, p): torque for a parameter off by its scale.
+
+        ``rigid`` is the regressor of the body, where it is known already.
+        """
         body, model = self.body, self.body.model
         result = np.zeros((len(motion.positions), body.n, len(self)))
         inertial = [i for i, one in enumerate(self.parameters) if one.kind not in OF_JOINTS]
         needs_torques = any(one.kind == "gear" for one in self.parameters)
         if inertial or needs_torques:
-            rows = body.regressor(motion)
+            rows = body.regressor(motion) if rigid is None else rigid
             result[:, :, inertial] = rows @ self._inertial_directions(inertial)
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
@@ -254,7 +257,7 @@ class Unknowns:
             result[INERTIAL * which : INERTIAL * (which + 1), i] = change
         return result
 
-    def information(self, motion: Motion, rate: float) -> Array:
+    def information(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the information of a motion in relative units, (p, p).
 
         Parameters
@@ -263,14 +266,14 @@ class Unknowns:
         rate : float
             Independent measurements of each torque in a second [Hz].
         """
-        flat = self.weighted(motion, rate).reshape(-1, len(self))
+        flat = self.weighted(motion, rate, rigid).reshape(-1, len(self))
         result: Array = flat.T @ flat
         return result
 
-    def weighted(self, motion: Motion, rate: float) -> Array:
+    def weighted(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the regressor in units of the noise, (T, n, p), as of ``rate`` rows a second."""
         noise = self.noise * self.limits.torque
-        result: Array = self.regressor(motion) * (np.sqrt(rate * motion.dt) / noise)[:, None]
+        result: Array = self.regressor(motion, rigid) * (np.sqrt(rate * motion.dt) / noise)[:, None]
         return result
 
 
@@ -342,7 +345,7 @@ def _sparse(rows: Array) -> Array:
             b_eq=[*np.zeros(p), 1.0],
             bounds=[(None, None)] * k + [(0.0, None)] * (2 * p),
         )
-        if one.success:
+        if one.success and one.x is not None:
             vector = one.x[:k] @ rows
             found.append(np.where(np.abs(vector) > SMALL * np.abs(vector).max(), vector, 0.0))
     found.sort(key=np.count_nonzero)

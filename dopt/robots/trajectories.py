@@ -103,7 +103,7 @@ class Fourier(Family):
 
     def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
         parts = numbers.reshape(2 * HARMONICS + 1, self.n)
-        rates = 2.0 * np.pi / self.period * np.arange(1, HARMONICS + 1)
+        rates: Array = 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
         cosines, sines = parts[1 : HARMONICS + 1], parts[HARMONICS + 1 :]
         return self._series(rates, cosines, sines, self._centres(parts[0]), dt, reach)
 
@@ -111,7 +111,7 @@ class Fourier(Family):
         self, rates: Array, cosines: Array, sines: Array, centres: Array, dt: float, reach: float
     ) -> Motion:
         """Return Σ (a cos ωt + b sin ωt)/ω between ramps, as large as the limits allow."""
-        t = dt * np.arange(max(round(self.seconds / dt), 2))
+        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
         phase = np.outer(t, rates)
         c, s = np.cos(phase), np.sin(phase)
         a, b = cosines / rates[:, None], sines / rates[:, None]
@@ -189,7 +189,7 @@ class Ladder(Family):
     def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
         parts = numbers.reshape(self.segments + 1, self.n)
         centres = self._centres(parts[0])
-        t = dt * np.arange(max(round(self.seconds / dt), 2))
+        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
         columns = []
         for k in range(self.n):
             low, high = self.limits.position[k]

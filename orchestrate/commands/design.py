@@ -126,10 +126,12 @@ def _check(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]
 
 def _told(problem: Problem, motion: Motion, errors: np.ndarray) -> dict[str, Any]:
     """Return what a motion says of the parameters."""
-    from dopt.robots.design import REFERENCES
+    from dopt.robots.design import COARSE, REFERENCES
     from dopt.robots.parameters import Identifiability
 
-    found = Identifiability.of(problem.unknowns, motion.every(20), problem.rate)
+    found = Identifiability.of(
+        problem.unknowns, motion.every(max(1, round(COARSE / motion.dt))), problem.rate
+    )
     return {
         "motions": REFERENCES,
         "seconds": problem.seconds,
@@ -167,7 +169,10 @@ def _expected(document: dict[str, Any], how: str) -> list[str]:
     """Return the expected intervals, the least certain first; what is not measured ends them."""
     rows = sorted(document["parameters"], key=lambda row: -row["relative"])
     known = [row for row in rows if row["relative"] < 1.96 / math.sqrt(2.0)]
-    lines = [f"expected half-widths of 95 % intervals, {how}:"]
+    lines = [
+        f"expected half-widths of 95 % intervals, {how}, if each parameter is known to about its "
+        f"own size before:"
+    ]
     for row in known[:SHOWN]:
         percent = f"{100.0 * row['relative']:.3g} %"
         lines.append(
