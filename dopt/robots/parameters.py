@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -302,11 +301,11 @@ class Identifiability:
         """Examine a motion, of which each torque is measured at a rate [Hz]."""
         rows = unknowns.weighted(motion, rate).reshape(-1, len(unknowns))
         sizes = np.linalg.norm(rows, axis=0)
-        sizes[sizes == 0.0] = 1.0
+        sizes = np.maximum(sizes, NULL * sizes.max())  # of columns that rounding alone fills
         _, values, vectors = np.linalg.svd(np.linalg.qr(rows / sizes, mode="r"))
         lost = values <= NULL * values[0]
         null = vectors[lost] / sizes
-        basis = _sparse(null)
+        basis = _sparse(null / np.abs(null).max(axis=1, keepdims=True))
         touched = np.abs(basis).max(axis=0, initial=0.0) > SMALL
         alone = np.linalg.norm(vectors[~lost].T / values[~lost], axis=1) / sizes
         weak = [
@@ -355,7 +354,7 @@ def _sparse(rows: Array) -> Array:
         together /= np.linalg.norm(together, axis=1, keepdims=True)
         if np.linalg.svd(together, compute_uv=False)[-1] > SMALL:
             basis.append(vector)
-    return np.array(basis)
+    return np.array(basis).reshape(-1, p)
 
 
 def _words(row: Array, unknowns: Unknowns) -> str:
@@ -365,8 +364,8 @@ def _words(row: Array, unknowns: Unknowns) -> str:
     if len(parts) == 1:
         return f"{unknowns.names[parts[0]]} has no effect"
     shown = unknowns.scales * row
-    first = shown[parts[0]]
-    named = [f"{_times(shown[i] / first)}{unknowns.names[i]}" for i in sorted(parts)]
+    unit = abs(shown[parts[0]]) * np.sign(shown[min(parts)])
+    named = [f"{_times(shown[i] / unit)}{unknowns.names[i]}" for i in sorted(parts)]
     text = " + ".join(named[:_SHOWN]).replace("+ −", "− ")
     more = f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else ""
     return f"{text}{more}"
@@ -379,13 +378,6 @@ def _times(factor: float) -> str:
     text = f"{abs(factor):.3g}"
     sign = "−" if factor < 0 else ""
     return sign if text == "1" else f"{sign}{text} · "
-
-
-def shortened(name: str) -> str:
-    """Return a name of a parameter for a table: its kind and the number of its place."""
-    kind, _, place = name.partition(":")
-    number = re.findall(r"\d+", place)
-    return f"{kind} {number[-1]}" if number else name
 
 
 __all__ = ["Identifiability", "Parameter", "Unknowns", "relative_errors"]

@@ -12,10 +12,9 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     import mujoco.sysid
-    import pandas as pd
 
 
-def sequences(body: Body, log: pd.DataFrame, name: str = "log") -> mujoco.sysid.ModelSequences:
+def sequences(body: Body, log: Any, name: str = "log") -> mujoco.sysid.ModelSequences:
     """Return a log with the specification of its robot, for ``mujoco.sysid.optimize``.
 
     The specification has a motor, which applies the torque, and a sensor of position for each
@@ -25,7 +24,7 @@ def sequences(body: Body, log: pd.DataFrame, name: str = "log") -> mujoco.sysid.
     ----------
     body : Body
         A robot that was read from a file.
-    log : DataFrame
+    log : DataFrame or mapping
         Columns ``time`` [s], evenly spaced, and ``q_JOINT`` [rad] and ``tau_JOINT`` [N m] of each
         driven joint, as ``orchestrate design --out`` names them. A torque acts from its row to the
         next.
@@ -63,14 +62,14 @@ def sequences(body: Body, log: pd.DataFrame, name: str = "log") -> mujoco.sysid.
     )
 
 
-def _column(log: pd.DataFrame, names: list[str]) -> Array:
-    missing = [one for one in names if one not in log.columns]
+def _column(log: Any, names: list[str]) -> Array:
+    missing = [one for one in names if one not in log]
     if missing:
         raise SpecificationError(
             f"a log has no column '{missing[0]}', but the columns time, q_JOINT and tau_JOINT of "
             f"each driven joint are expected: rename its columns."
         )
-    values = log[names].to_numpy(dtype=float)
+    values = np.column_stack([np.asarray(log[one], dtype=float) for one in names])
     if not np.isfinite(values).all():
         raise SpecificationError(
             f"the columns {', '.join(names[:3])} of a log hold a number that is not finite, but "

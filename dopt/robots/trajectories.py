@@ -122,9 +122,8 @@ class Fourier(Family):
         positions = w * shape
         velocities = w1 * shape + w * rate
         accelerations = w2 * shape + 2.0 * w1 * rate + w * turn
-        room = np.minimum(
-            centres - self.limits.position[:, 0], self.limits.position[:, 1] - centres
-        )
+        half = np.diff(self.limits.position, axis=1)[:, 0] / 2.0
+        room = half - np.abs(centres - self.limits.middle) / ROOM
         taken = np.max(
             [
                 np.abs(positions).max(axis=0) / room,
