@@ -301,8 +301,10 @@ class Identifiability:
         """Examine a motion, of which each torque is measured at a rate [Hz]."""
         rows = unknowns.weighted(motion, rate).reshape(-1, len(unknowns))
         sizes = np.linalg.norm(rows, axis=0)
-        sizes = np.maximum(sizes, NULL * sizes.max())  # of columns that rounding alone fills
+        dead = sizes <= NULL * sizes.max()  # of columns that rounding alone fills
+        sizes[dead] = np.inf
         _, values, vectors = np.linalg.svd(np.linalg.qr(rows / sizes, mode="r"))
+        sizes[dead] = 1.0
         lost = values <= NULL * values[0]
         null = vectors[lost] / sizes
         basis = _sparse(null / np.abs(null).max(axis=1, keepdims=True))
