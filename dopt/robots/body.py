@@ -8,6 +8,7 @@ linear ones: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 from __future__ import annotations
 
 import dataclasses
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     import mujoco
+
+_log = logging.getLogger(__name__)
 
 INERTIAL = 10
 """Inertial parameters of a body: m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about its origin."""
@@ -81,6 +84,7 @@ class Body:
     def __init__(self, model: mujoco.MjModel, source: Path | None = None) -> None:
         import mujoco
 
+        _log_warnings()
         self.model, self.source = model, source
         self._ids = _driven_joints(model)
         if not self._ids:
@@ -345,6 +349,14 @@ def _rotation(quaternion: Array) -> Array:
     k = _skew(v[None])[0]
     result: Array = np.eye(3) + 2.0 * (w * k + k @ k)
     return result
+
+
+def _log_warnings() -> None:
+    """Have the engine's warnings logged: it would write a file into the working folder."""
+    import mujoco
+
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(lambda text: _log.info("MuJoCo warns: %s", text))
 
 
 def _driven_joints(model: mujoco.MjModel) -> list[int]:
