@@ -27,6 +27,9 @@ from dopt.types import Array
 COARSE = 0.04
 """Time between the rows of a motion while it is searched [s]."""
 
+FINE = 0.01
+"""Time between the rows of a motion whose torques and collisions are checked at the end [s]."""
+
 REFERENCES = 25
 """Random multisines, whose median errors every design is compared with."""
 
@@ -259,6 +262,12 @@ class Design:
                 "torques."
             )
         return cls(problem, tuple(shared), problem.reference, gap / max(identified, 1))
+
+
+def _is_free(problem: Problem, one: Candidate) -> bool:
+    """Return True if a motion keeps the torques and no bodies touch, by finer steps."""
+    motion = one.motion(FINE)
+    return problem.strain(motion) <= 1.0 and not problem.body.collisions(motion.positions)
 
 
 def _null(problem: Problem, one: Candidate) -> list[str]:

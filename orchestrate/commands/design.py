@@ -298,7 +298,7 @@ def _draw(target: Path, problem: Problem, motion: Motion) -> None:
     axes[-1].set(xlabel="time [s]")
     figure.supylabel("share of the limit", fontsize=8)
     with whole(target) as partial:
-        figure.savefig(partial, dpi=150)
+        figure.savefig(partial, dpi=100)
 
 
 DESIGN_COMMAND = Command(
