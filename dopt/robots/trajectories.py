@@ -8,6 +8,7 @@ joint by segments of constant speed.
 from __future__ import annotations
 
 import dataclasses
+import math
 from abc import ABC, abstractmethod
 
 import numpy as np
@@ -166,7 +167,7 @@ class Multisine(Fourier):
 
 @dataclasses.dataclass(frozen=True)
 class Ladder(Family):
-    """Segments of constant speed for each joint, between ramps of constant acceleration.
+    """Segments of constant speed for each joint, between smooth ramps.
 
     Numbers choose the speeds, a log-uniform draw, and the places of the start. A segment moves to
     the side that has more room, and ends where the room does.
@@ -208,7 +209,7 @@ class Ladder(Family):
 
 
 class Path1:
-    """Path of one joint whose velocity is linear between times: ramps and constant speeds.
+    """Path of one joint at constant speeds, between ramps without jumps of the acceleration.
 
     Parameters
     ----------
@@ -217,11 +218,11 @@ class Path1:
     room : tuple of float
         Least and largest position.
     acceleration : float
-        Of the ramps.
+        Largest magnitude, in the middle of each ramp.
     """
 
     def __init__(self, start: float, room: tuple[float, float], acceleration: float) -> None:
-        self.room, self._a = room, acceleration
+        self.room, self._mean = room, acceleration / 1.5  # by a ramp v = 3 s² - 2 s³
         self._times, self._speeds = [0.0], [0.0]
         self.position = float(np.clip(start, *room))
         self._start = self.position
@@ -240,35 +241,38 @@ class Path1:
             self._times.append(self.now + seconds)
             self._speeds.append(speed)
 
-    def _brakes(self, speed: float) -> float:
+    def _way(self, speed: float) -> float:
         """Return the way from a speed to rest."""
-        return speed * abs(speed) / (2.0 * self._a)
+        return speed * abs(speed) / (2.0 * self._mean)
 
     def move(self, magnitude: float, seconds: float, end: float) -> None:
         """Add a segment of a speed, whose sign has more room, that can still come to rest in it."""
-        sign = 1.0 if sum(self.room) >= 2.0 * (self.position + self._brakes(self.speed)) else -1.0
+        sign = 1.0 if sum(self.room) >= 2.0 * (self.position + self._way(self.speed)) else -1.0
         target = sign * magnitude
-        ramp = abs(target - self.speed) / self._a
+        ramp = abs(target - self.speed) / self._mean
         after = self.position + 0.5 * (self.speed + target) * ramp
         wall = self.room[1] if sign > 0 else self.room[0]
-        left = sign * (wall - after) - magnitude**2 / (2.0 * self._a)
+        left = sign * (wall - after) - self._way(magnitude)
         hold = min(seconds, left / magnitude)
-        rest = end - self.now - magnitude / self._a - ramp
-        if hold <= 0.0 or rest <= 0.0 or not self._inside(target, ramp):
+        rest = end - self.now - magnitude / self._mean - ramp
+        turn = self.position + self._turn(target, ramp)
+        inside = self.room[0] - 1e-9 <= turn <= self.room[1] + 1e-9
+        if hold <= 0.0 or rest <= 0.0 or not inside:
             self._brake(end)
             return
         self._to(target, ramp)
         self._to(target, min(hold, rest))
 
-    def _inside(self, target: float, ramp: float) -> bool:
-        """Return True if the ramp to a speed stays in the room, also where it turns."""
+    def _turn(self, target: float, ramp: float) -> float:
+        """Return the way to the point where a ramp to another sign turns; 0 without one."""
         if self.speed * target >= 0.0:
-            return True
-        turns = self.position + self._brakes(self.speed)
-        return self.room[0] - 1e-9 <= turns <= self.room[1] + 1e-9 and ramp > 0.0
+            return 0.0
+        change = target - self.speed
+        s = 0.5 - math.sin(math.asin(1.0 + 2.0 * self.speed / change) / 3.0)
+        return ramp * (self.speed * s + change * (s**3 - 0.5 * s**4))
 
     def _brake(self, end: float) -> None:
-        self._to(0.0, min(abs(self.speed) / self._a, max(end - self.now, 0.0)))
+        self._to(0.0, min(abs(self.speed) / self._mean, max(end - self.now, 0.0)))
 
     def rest(self, end: float) -> None:
         """Brake, and stay until the end."""
@@ -278,20 +282,15 @@ class Path1:
     def sampled(self, t: Array) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations at some times, (T,) each."""
         times, speeds = np.array(self._times), np.array(self._speeds)
-        steps = np.diff(times)
-        slopes = np.diff(speeds) / steps
-        places = self._start + np.concatenate(
-            [[0.0], np.cumsum((speeds[1:] + speeds[:-1]) / 2 * steps)]
-        )
+        steps, changes = np.diff(times), np.diff(speeds)
+        ways = np.cumsum((speeds[1:] + speeds[:-1]) / 2.0 * steps)
+        places = self._start + np.concatenate([[0.0], ways])
         at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(steps) - 1)
-        since = np.minimum(t, times[-1]) - times[at]
-        accelerations = np.where(t < times[-1], slopes[at], 0.0)
-        velocities = speeds[at] + slopes[at] * since
-        return (
-            places[at] + speeds[at] * since + 0.5 * slopes[at] * since**2,
-            velocities,
-            accelerations,
-        )
+        s = np.clip((t - times[at]) / steps[at], 0.0, 1.0)
+        step, change = steps[at], changes[at]
+        positions = places[at] + step * (speeds[at] * s + change * (s**3 - 0.5 * s**4))
+        velocities = speeds[at] + change * s**2 * (3.0 - 2.0 * s)
+        return positions, velocities, change / step * 6.0 * s * (1.0 - s)
 
 
 def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:

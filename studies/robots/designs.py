@@ -2,7 +2,7 @@
 
 ``python -m studies.robots.designs --urdf MODEL --limits FILE --seeds 20`` appends a row for each arm
 and seed to ``docs/robots_designs.csv``. The seed draws the multisines, the search, and a robot whose
-parameters differ from the file's by 10 % of each one's size.
+parameters differ from the file's by 10 % of each one's size; torques are measured with white noise.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ UNKNOWN = "mass,com,inertia,armature,damping,frictionloss,gear"
 OFF = 0.1
 """Standard deviation of a true parameter about the file's, by its size."""
 
-WINDOW = 21
-"""Samples of a local cubic: 102 ms."""
+WINDOW = 31
+"""Samples of a local cubic: 62 ms."""
 
 TURNING = 0.05
 """Share of the limit of velocity below which a joint is left out of the fit.
@@ -168,9 +168,11 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
         width=np.ones(body.n),
         smooth=SLOW * limits.velocity,
     )
-    robot = SimulatedRobot(true, limits, seed, friction, ripple=0.0)
+    robot = SimulatedRobot(true, limits, seed, friction, noise=0.0, ripple=0.0)
     motion = best.motion(CONTROL)
-    found = fitted(problem, measured(robot, body, gears, motion), motion)
+    rows = measured(robot, body, gears, motion)
+    rows[:, 1] += problem.unknowns.noise * limits.torque * rng.standard_normal(rows[:, 1].shape)
+    found = fitted(problem, rows, motion)
     sure = best.errors < KNOWN
     z = ((found - off) / best.errors)[sure]
     return {

@@ -44,15 +44,16 @@ def test_motions_keep_limits_begin_and_end_at_rest_and_are_integrals(
         moved = motion.positions[0] + np.cumsum(mean, axis=0) * motion.dt
         np.testing.assert_allclose(motion.positions[1:], moved, atol=2e-4, err_msg=family.name)
         slopes = np.diff(motion.velocities, axis=0) / motion.dt
+        mean = (motion.accelerations[1:] + motion.accelerations[:-1]) / 2.0
+        off = np.abs(slopes - mean) / limits.acceleration
+        assert np.quantile(off, 0.9) < 0.01, family.name  # short ramps fall between two rows
         assert (np.abs(slopes) <= limits.acceleration).all(), family.name
-        off = np.abs(slopes - motion.accelerations[:-1]) / limits.acceleration
-        assert np.quantile(off, 0.9) < 0.03, family.name  # a ladder's ramps begin and end
 
 
 def test_a_ladder_holds_constant_speeds(limits: Limits) -> None:
     ladder = Ladder(limits, 10.0)
     motion = ladder.motion(np.random.default_rng(0).standard_normal(ladder.size), 0.002)
-    still = motion.accelerations == 0.0
+    still = np.abs(motion.accelerations) < 1e-9
     fast = np.abs(motion.velocities) > 1e-9
     assert (still & fast).mean() > 0.4
 
