@@ -1,0 +1,410 @@
+"""Friction of a robot's joints, learned from what its known body does not explain.
+
+What is learned is the missing torque τ - ID(q, q̇, q̈) of each joint as a function of its own rate:
+the information is one block a joint. Torques are learned as parts x of the torque limit, rates as
+parts of the velocity limit. Torque that depends on the position (ripple) is a nuisance: a random
+function with 10 to 40 periods a turn, whose coefficients are learned and told apart from friction.
+
+An interval holds at all times at once: normal mixture with a delayed start, H. Robbins, "Statistical
+methods related to the law of the iterated logarithm", Ann. Math. Stat. 41, 5 (1970); S. R. Howard,
+A. Ramdas, J. McAuliffe and J. Sekhon, Ann. Stat. 49, 2 (2021); for one of several coefficients
+M. Lindon et al., "Anytime-valid linear models" (arXiv:2210.08589). The inputs depend on what was
+learned, which the last one does not cover: `studies/robots/online.py` measures the coverage.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from dopt.errors import unknown_name
+from dopt.robots.limits import Limits
+from dopt.types import Array
+
+WINDOW = 20
+"""Periods of control in a window, whose samples become one equation a joint."""
+
+SLOW = 0.01
+"""Windows in which a joint is slower than this part of its limit teach nothing of its friction."""
+
+SPEEDS = np.geomspace(0.02, 0.95, 12)
+"""Parts of the velocity limit at which the friction curve is judged."""
+
+RIPPLE = np.arange(10.0, 41.0)
+"""Periods a turn, or in 2π m, of torque that depends on the position."""
+
+RIPPLE_SIZE = 1.5
+"""Standard deviation of the ripple before any sample, in multiples of that of a window's noise."""
+
+NOISE = 0.003
+"""Standard deviation of a window's torque before any sample, as a part of the limit."""
+
+EXPECTED = 0.04
+"""Size of friction before any sample, as a part of the torque limit."""
+
+BATCH = 10
+"""Windows in a batch, whose means show how far innovations are correlated."""
+
+SIGN = 0.003
+"""Width in which dry friction is taken to change its sign."""
+
+
+class FrictionModel(Protocol):
+    """Friction of n joints with p parameters each; rates and torques as parts of the limits."""
+
+    start: Array
+    """Parameters before any sample, (n, p)."""
+    spread: Array
+    """Their standard deviations, (p,)."""
+
+    def torques(self, parameters: Array, x: Array) -> Array:
+        """Return f at rates (n, k), (n, k)."""
+
+    def jacobian(self, parameters: Array, x: Array) -> Array:
+        """Return J = ∂f/∂θ, (n, k, p)."""
+
+    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
+        """Return ∂f/∂x, (n, k), and ∂J/∂x, (n, k, p)."""
+
+
+class CoulombViscous:
+    """Coulomb and viscous friction, and Stribeck terms of fixed widths: linear in its parameters.
+
+    The parameters are the Coulomb torque, the viscous torque at the velocity limit, and heights.
+    """
+
+    widths = np.array([0.015, 0.03, 0.06])
+    spread = np.array([0.1, 0.1, 0.015, 0.015, 0.015])
+
+    def __init__(self, n: int) -> None:
+        self.start = np.zeros((n, len(self.spread)))
+
+    def torques(self, parameters: Array, x: Array) -> Array:
+        result: Array = np.einsum("nkp,np->nk", self.jacobian(parameters, x), parameters)
+        return result
+
+    def jacobian(self, parameters: Array, x: Array) -> Array:  # noqa: ARG002  # linear in them
+        sign = np.tanh(x / SIGN)
+        heights = sign[..., None] * np.exp(-((x[..., None] / self.widths) ** 2))
+        return np.concatenate([sign[..., None], x[..., None], heights], axis=2)
+
+    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
+        sign = np.tanh(x / SIGN)
+        turned = (1.0 - sign**2) / SIGN
+        bells = np.exp(-((x[..., None] / self.widths) ** 2))
+        falling = bells * -2.0 * x[..., None] / self.widths**2
+        heights = turned[..., None] * bells + sign[..., None] * falling
+        rows = np.concatenate([turned[..., None], np.ones_like(x)[..., None], heights], axis=2)
+        return np.einsum("nkp,np->nk", rows, parameters), rows
+
+
+class Network:
+    """Network of 7 tanh units of the rate: f(x) = d + Σ_k c_k tanh(s_k x + b_k), 22 parameters.
+
+    The parameters are c, ln s, b and d; the scales s begin spread from dry friction to viscous.
+    """
+
+    scales = np.array([100.0, 50.0, 25.0, 12.0, 5.0, 2.0, 0.7])
+    spread = np.concatenate([np.full(7, 0.06), np.full(7, 0.3), np.full(7, 0.1), [0.003]])
+
+    def __init__(self, n: int, seed: int = 0) -> None:
+        random = np.random.default_rng(seed)
+        self.start = np.zeros((n, 22))
+        self.start[:, :7] = random.uniform(0.002, 0.01, (n, 7))
+        self.start[:, 7:14] = np.log(self.scales)
+
+    def _units(self, parameters: Array, x: Array) -> tuple[Array, Array, Array, Array]:
+        c, s = parameters[:, None, :7], np.exp(parameters[:, None, 7:14])
+        t = np.tanh(s * x[..., None] + parameters[:, None, 14:21])
+        return c, s, t, 1.0 - t**2
+
+    def torques(self, parameters: Array, x: Array) -> Array:
+        c, _, t, _ = self._units(parameters, x)
+        result: Array = (c * t).sum(axis=2) + parameters[:, 21:]
+        return result
+
+    def jacobian(self, parameters: Array, x: Array) -> Array:
+        c, s, t, bent = self._units(parameters, x)
+        one = np.ones((*x.shape, 1))
+        return np.concatenate([t, c * bent * s * x[..., None], c * bent, one], axis=2)
+
+    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
+        c, s, t, bent = self._units(parameters, x)
+        falling = -2.0 * t * bent * s
+        of_scales = c * s * (bent + falling * x[..., None])
+        none = np.zeros((*x.shape, 1))
+        rows = np.concatenate([bent * s, of_scales, c * falling, none], axis=2)
+        return (c * bent * s).sum(axis=2), rows
+
+
+FRICTION = {"coulomb_viscous": lambda n, seed: CoulombViscous(n), "network": Network}  # noqa: ARG005
+
+
+class Window:
+    """Weights that make one equation of the samples of a window.
+
+    A second-order polynomial through the positions q_0 … q_N by least squares has an acceleration
+    c·q, which is also Σ w_i q̈_i over second differences. Torques, positions and rates averaged by
+    the same w obey the same equation of motion.
+    """
+
+    def __init__(self, dt: float, size: int = WINDOW) -> None:
+        t = dt * (np.arange(size + 1) - size / 2)
+        self.acceleration = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2 / 2], axis=1))[2]
+        self.weights = np.zeros(size + 1)
+        self.weights[1:-1] = dt**2 * np.cumsum(np.cumsum(self.acceleration))[:-2]
+        rates = np.zeros(size + 1)
+        rates[2:] += self.weights[1:-1] / (2 * dt)
+        rates[:-2] -= self.weights[1:-1] / (2 * dt)
+        self.rate, self.times = rates, t
+
+    def means(self, positions: Array, torques: Array) -> tuple[Array, Array, Array, Array]:
+        """Return position, rate, acceleration and torque, each (n,), of samples (N + 1, n)."""
+        return (
+            self.weights @ positions,
+            self.rate @ positions,
+            self.acceleration @ positions,
+            self.weights @ torques,
+        )
+
+
+class FrictionLearner:
+    """Recursive least squares of friction and ripple, one block a joint, by windows of samples.
+
+    A network is linearised at its present parameters: an extended Kalman filter at rest.
+
+    Parameters
+    ----------
+    limits : Limits
+    inverse : function
+        Torques of the known body, (n,), at position, velocity and acceleration, each (n,).
+    friction : str
+        A key of ``FRICTION``.
+    dt : float
+        Period of control [s].
+    relative : float
+        Half-width of the curve's interval that is asked for, relative to the curve's root mean
+        square: the intervals are narrowest there.
+    seed : int
+        Seed of the network's first parameters.
+    level : float
+        Probability that an interval misses, 0.05.
+    """
+
+    def __init__(
+        self,
+        limits: Limits,
+        inverse: Callable[[Array, Array, Array], Array],
+        friction: str = "coulomb_viscous",
+        dt: float = 0.002,
+        relative: float = 0.05,
+        seed: int = 0,
+        level: float = 0.05,
+    ) -> None:
+        if friction not in FRICTION:
+            raise unknown_name("friction", friction, FRICTION)
+        n = len(limits.torque)
+        self.limits, self.window, self._inverse = limits, Window(dt), inverse
+        self.model: FrictionModel = FRICTION[friction](n, seed)
+        self.n, self.p = n, self.model.start.shape[1]
+        spread = self.model.spread / NOISE
+        ripple = np.full(2 * len(RIPPLE), RIPPLE_SIZE / math.sqrt(len(RIPPLE)))
+        self.mean = np.concatenate([self.model.start, np.zeros((n, len(ripple)))], axis=1)
+        self._prior = np.diag(np.concatenate([spread, ripple]) ** 2)
+        self.covariance = np.tile(self._prior, (n, 1, 1))
+        self._squares = np.full((2, n), [[10.0 * NOISE**2], [10.0]])
+        self._batches, self._pending = np.full((2, n), 10.0), np.zeros((2, n))
+        self.boundary, self.relative = boundary(level), relative
+        self._expected: Array | None = None
+        self.windows = np.zeros(n, dtype=int)
+
+    @property
+    def noise(self) -> Array:
+        """Standard deviation of a window's torque, (n,), as a part of the limit."""
+        result: Array = np.sqrt(self._squares[0] / self._squares[1])
+        return result
+
+    @property
+    def inflation(self) -> Array:
+        """Variance of means of innovations relative to uncorrelated ones, (n,), at least 1."""
+        return np.maximum(1.0, self._batches[0] / self._batches[1])
+
+    def torques(self, velocities: Array) -> Array:
+        """Return the friction learned so far [N m], (n,), at velocities (n,)."""
+        x = (velocities / self.limits.velocity)[:, None]
+        result: Array = self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
+        return result
+
+    def features(self, q: Array) -> Array:
+        """Return the features of ripple at positions (..., n), (..., n, 62)."""
+        angles = q[..., None] * RIPPLE
+        return np.concatenate([np.cos(angles), np.sin(angles)], axis=-1)
+
+    def innovations(self, means: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array]:
+        """Return e, H and its prior variance in units of noise: (n,), (n, d) and (n,).
+
+        Where a joint is too slow, e is NaN and H zero.
+        """
+        q, v, a, torque = means
+        x, slope = v / self.limits.velocity, a / self.limits.velocity
+        half = np.abs(slope) * self.window.times[-1]
+        moving = np.abs(x) - half > SLOW
+        within = x[:, None] + slope[:, None] * self.window.times[1:-1]
+        weights = self.window.weights[1:-1]
+        parameters = self.mean[:, : self.p]
+        mean = self.model.torques(parameters, within) @ weights
+        rows = weights @ self.model.jacobian(parameters, within)
+        features = self.features(q)
+        missing = (torque - self._inverse(q, v, a)) / self.limits.torque
+        missing = missing - mean - (features * self.mean[:, self.p :]).sum(axis=1)
+        rows = np.concatenate([rows, features], axis=1) * moving[:, None]
+        variance = (rows * self._spread(rows)).sum(axis=1)
+        return np.where(moving, missing, np.nan), rows, variance
+
+    def _spread(self, rows: Array) -> Array:
+        result: Array = np.squeeze(self.covariance @ rows[..., None], 2)
+        return result
+
+    def learn(self, means: tuple[Array, Array, Array, Array]) -> Array:
+        """Learn from a window; return its standardised innovations, (n,), NaN where it is slow."""
+        missing, rows, variance = self.innovations(means)
+        moving = np.isfinite(missing)
+        error = np.where(moving, missing, 0.0)
+        standard = error / np.sqrt(1.0 + variance)
+        result = np.where(moving, standard / self.noise, np.nan)
+        spread = self._spread(rows)
+        self.mean += spread * (error / (1.0 + variance))[:, None]
+        self.covariance -= (
+            spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
+        )
+        self._squares += np.where(moving, [standard**2, np.ones(self.n)], 0.0)
+        self._pending += np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
+        full = self._pending[1] >= BATCH
+        self._batches += np.where(full, [self._pending[0] ** 2 / BATCH, np.ones(self.n)], 0.0)
+        self._pending[:, full] = 0.0
+        self.windows += moving
+        return result
+
+    def forget(self, factor: float) -> None:
+        """Widen what is known of friction: the body that it was learned with has changed."""
+        p = self.p
+        wide = self._prior[:p, :p]
+        self.covariance[:, :p, p:] *= math.sqrt(factor)
+        self.covariance[:, p:, :p] *= math.sqrt(factor)
+        self.covariance[:, :p, :p] *= factor
+        over = np.diagonal(self.covariance[:, :p, :p], axis1=1, axis2=2) > np.diag(wide)
+        shrink = np.where(over, 0.5, 1.0)
+        self.covariance[:, :p, :p] *= shrink[:, :, None] * shrink[:, None, :]
+        self.covariance[:, :p, p:] *= shrink[:, :, None]
+        self.covariance[:, p:, :p] *= shrink[:, None, :]
+        self._expected = None
+
+    def _rows(self, speeds: Array) -> Array:
+        """Return the gradients of the curve at speeds, and of the two constants, (n, k + 2, p).
+
+        The constants of a network are the line through the curve at half of the limit and at it.
+        """
+        x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
+        rows = self.model.jacobian(self.mean[:, : self.p], x)
+        if isinstance(self.model, CoulombViscous):
+            rows[:, -2:] = np.eye(2, self.p)
+        else:
+            half, full = rows[:, -2].copy(), rows[:, -1].copy()
+            rows[:, -2], rows[:, -1] = 2.0 * half - full, 2.0 * (full - half)
+        return rows
+
+    def _values(self, speeds: Array) -> Array:
+        parameters = self.mean[:, : self.p]
+        x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
+        values = self.model.torques(parameters, x)
+        half, full = values[:, -2].copy(), values[:, -1].copy()
+        values[:, -2], values[:, -1] = 2.0 * half - full, 2.0 * (full - half)
+        if isinstance(self.model, CoulombViscous):
+            values[:, -2:] = parameters[:, :2]
+        return values
+
+    def deviations(self, speeds: Array = SPEEDS) -> Array:
+        """Return standard errors as parts of the torque limit, (n, k + 2), as :meth:`intervals`."""
+        rows = self._rows(speeds)
+        block = self.covariance[:, : self.p, : self.p]
+        variance = np.einsum("nkp,npq,nkq->nk", rows, block, rows)
+        scale = self.noise * np.sqrt(self.inflation)
+        result: Array = np.sqrt(np.maximum(variance, 0.0)) * scale[:, None]
+        return result
+
+    def intervals(self) -> tuple[Array, Array]:
+        """Return values and half-widths as parts of the torque limit, each (n, 14).
+
+        The columns are the curve at ``SPEEDS``, Coulomb friction, and viscous at full velocity.
+        """
+        values, errors = self._values(SPEEDS), self.deviations()
+        return values, half_widths(errors, self._information(values, errors), self.boundary)
+
+    def sizes(self) -> Array:
+        """Return the root mean square of each joint's curve, (n,), as a part of the limit."""
+        return np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
+
+    def _information(self, values: Array, errors: Array) -> Array:
+        """Return the information expected at the stop, (n, 14).
+
+        It is fixed once the curves are known to a fifth of their sizes; a first guess comes before.
+        """
+        if self._expected is not None:
+            return self._expected
+        sizes = np.sqrt((values[:, :-2] ** 2).mean(axis=1))
+        widest = errors[:, :-2].max(axis=1)
+        known = bool((widest < 0.2 * sizes).all())
+        half = self.relative * (sizes if known else np.full(self.n, EXPECTED))
+        expected: Array = (self.boundary * widest / half)[:, None] ** 2 / errors**2
+        if known:
+            self._expected = expected
+        return expected
+
+    def curve(self, joint: int, velocities: Array) -> tuple[Array, Array, Array]:
+        """Return friction [N m] and the ends of its intervals, each (k,), at velocities (k,)."""
+        unit, x = self.limits.torque[joint], np.asarray(velocities) / self.limits.velocity[joint]
+        values, errors = self._values(x)[joint, :-2], self.deviations(x)[joint, :-2]
+        known = self._information(self._values(SPEEDS), self.deviations())[joint, :-2]
+        speeds = np.log(np.clip(np.abs(x), SPEEDS[0], SPEEDS[-1]))
+        expected = np.exp(np.interp(speeds, np.log(SPEEDS), np.log(known)))
+        half = half_widths(errors, expected, self.boundary)
+        return values * unit, (values - half) * unit, (values + half) * unit
+
+
+def boundary(level: float) -> float:
+    """Return a with 4 (1 - Φ(a)) + 2 a φ(a) = level.
+
+    |S| ≤ a √m until the information I reaches m, and |S| ≤ √(I (a² + ln(I/m))) ever after, are
+    together kept with probability 1 - level by a sum S of variance I: Robbins (1970) from m on,
+    and by reflection before.
+    """
+    from scipy.optimize import brentq
+    from scipy.stats import norm
+
+    return float(
+        brentq(lambda a: 4.0 * norm.sf(a) + 2.0 * a * norm.pdf(a) - level, 1.0, 9.0, xtol=1e-9)
+    )
+
+
+def half_widths(errors: Array, expected: Array, a: float) -> Array:
+    """Return half-widths that hold at all times, of standard errors and information expected."""
+    information = 1.0 / np.maximum(errors, 1e-300) ** 2
+    later = np.sqrt((a**2 + np.log(np.maximum(information / expected, 1.0))) / information)
+    result: Array = np.where(information < expected, a * np.sqrt(expected) / information, later)
+    return result
+
+
+__all__ = [
+    "FRICTION",
+    "SPEEDS",
+    "CoulombViscous",
+    "FrictionLearner",
+    "FrictionModel",
+    "Network",
+    "Window",
+    "boundary",
+    "half_widths",
+]
