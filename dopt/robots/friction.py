@@ -24,8 +24,11 @@ from dopt.errors import unknown_name
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
-WINDOW = 20
-"""Periods of control in a window, whose samples become one equation a joint."""
+WINDOW = 20, 100
+"""Least and most periods of control in a window, whose samples become one equation a joint."""
+
+ENCODER, TORQUE_NOISE = 2.8e-5, 0.01
+"""Errors that are expected of a position [rad], 16 bits, and of a torque, as a part of its limit."""
 
 SLOW = 0.01
 """Windows in which a joint is slower than this part of its limit teach nothing of its friction."""
@@ -151,15 +154,18 @@ class Window:
     the same w obey the same equation of motion.
     """
 
-    def __init__(self, dt: float, size: int = WINDOW) -> None:
+    def __init__(self, dt: float, size: int = WINDOW[0]) -> None:
         t = dt * (np.arange(size + 1) - size / 2)
         self.acceleration = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2 / 2], axis=1))[2]
         self.weights = np.zeros(size + 1)
         self.weights[1:-1] = dt**2 * np.cumsum(np.cumsum(self.acceleration))[:-2]
+        # A torque acts until the next sample: half of it in each of two second differences.
+        self.of_torques = np.zeros(size + 1)
+        self.of_torques[:-1] = 0.5 * (self.weights[:-1] + self.weights[1:])
         rates = np.zeros(size + 1)
         rates[2:] += self.weights[1:-1] / (2 * dt)
         rates[:-2] -= self.weights[1:-1] / (2 * dt)
-        self.rate, self.times = rates, t
+        self.rate, self.times, self.size, self.seconds = rates, t, size, size * dt
 
     def means(self, positions: Array, torques: Array) -> tuple[Array, Array, Array, Array]:
         """Return position, rate, acceleration and torque, each (n,), of samples (N + 1, n)."""
@@ -167,7 +173,7 @@ class Window:
             self.weights @ positions,
             self.rate @ positions,
             self.acceleration @ positions,
-            self.weights @ torques,
+            self.of_torques @ torques,
         )
 
 
@@ -192,6 +198,8 @@ class FrictionLearner:
         Seed of the network's first parameters.
     level : float
         Probability that an interval misses, 0.05.
+    window : int
+        Periods of control in a window.
     """
 
     def __init__(
@@ -203,11 +211,12 @@ class FrictionLearner:
         relative: float = 0.05,
         seed: int = 0,
         level: float = 0.05,
+        window: int = WINDOW[0],
     ) -> None:
         if friction not in FRICTION:
             raise unknown_name("friction", friction, FRICTION)
         n = len(limits.torque)
-        self.limits, self.window, self._inverse = limits, Window(dt), inverse
+        self.limits, self.window, self._inverse = limits, Window(dt, window), inverse
         self.model: FrictionModel = FRICTION[friction](n, seed)
         self.n, self.p = n, self.model.start.shape[1]
         spread = self.model.spread / NOISE
@@ -277,9 +286,7 @@ class FrictionLearner:
         result = np.where(moving, standard / self.noise, np.nan)
         spread = self._spread(rows)
         self.mean += spread * (error / (1.0 + variance))[:, None]
-        self.covariance -= (
-            spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
-        )
+        self.covariance -= spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
         self._squares += np.where(moving, [standard**2, np.ones(self.n)], 0.0)
         self._pending += np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
         full = self._pending[1] >= BATCH
@@ -374,6 +381,20 @@ class FrictionLearner:
         return values * unit, (values - half) * unit, (values + half) * unit
 
 
+def window_size(inertia: Array, limits: Limits, dt: float) -> int:
+    """Return the periods after which errors of encoders add a fifth to the noise of torques.
+
+    Least squares over N periods leave σ √(720/N⁵)/dt² in an acceleration, and 1.2 σ/√N in a torque.
+
+    Parameters
+    ----------
+    inertia : (n,)
+        Largest inertia of each joint [kg m²].
+    """
+    size = 720.0 * (inertia / limits.torque * ENCODER / (dt**2 * TORQUE_NOISE)) ** 2 / (0.2 * 1.43)
+    return int(np.clip(2 * np.ceil(size.max() ** 0.25 / 2), *WINDOW))
+
+
 def boundary(level: float) -> float:
     """Return a with 4 (1 - Φ(a)) + 2 a φ(a) = level.
 
@@ -407,4 +428,5 @@ __all__ = [
     "Window",
     "boundary",
     "half_widths",
+    "window_size",
 ]

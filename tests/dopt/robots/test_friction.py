@@ -44,8 +44,8 @@ def test_a_window_is_exact_where_torque_accelerates_a_mass() -> None:
     torques = random.standard_normal((len(window.weights), 2))
     q, v = np.zeros((len(torques), 2)), np.array([0.3, -0.1])
     for i in range(1, len(torques)):
+        q[i] = q[i - 1] + DT * v + 0.5 * DT**2 * torques[i - 1]
         v = v + DT * torques[i - 1]
-        q[i] = q[i - 1] + DT * v
     _, _, acceleration, torque = window.means(q, torques)
     assert window.weights.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(acceleration, torque, rtol=1e-9)
