@@ -155,7 +155,8 @@ class RobotExplorer:
         self._rows: list[tuple[Array, Array]] = []
         self._recent: deque[Array] = deque(maxlen=RECENT)
         self._payload: list[tuple[Array, ...]] | None = None
-        self._done, self._time = False, None
+        self._done = False
+        self._due: float | None = None
         self._alarm = _alarm(n)
 
     @property
@@ -206,8 +207,9 @@ class RobotExplorer:
         torque = (
             self._torque if applied is None else arguments.numbers("applied", applied, self.body.n)
         )
-        self._check_time(time, self.dt)
         self._asked = False
+        self._due = None if self._due is None else self._due + self.dt
+        self._check_time(time)
         self.steps += 1
         if self._wrong or not np.isfinite(torque).all():
             self._rows.clear()
@@ -227,16 +229,13 @@ class RobotExplorer:
         self._tracker.place(measured)
         self._q = measured.copy()
 
-    def _check_time(self, time: float | None, ahead: float = 0.0) -> None:
+    def _check_time(self, time: float | None) -> None:
+        """End the window of samples where the time is not the one that is expected."""
         now = arguments.seconds(time)
-        if now is None:
-            return
-        if self._time is not None and abs(now - ahead - self._time) > 0.5 * self.dt:
+        if now is not None and abs(now - (now if self._due is None else self._due)) > 0.5 * self.dt:
             self.counts["late"] += 1
             self._rows.clear()
-        self._time = now if ahead else now
-        if not ahead:
-            self._time = now
+        self._due = self._due if now is None else now
 
     def _sensible(self, measured: Array, expected: Array) -> bool:
         room = 4.0 * self.dt * self.limits.velocity + 0.001 * np.ptp(self.limits.position, axis=1)
@@ -313,7 +312,21 @@ class RobotExplorer:
         variance = 1.0 / np.maximum(hold / learner.window.seconds - 0.5, 0.5) + (X * spread).sum(axis=1)
         own = spread[:, :p]
         shares = (own * np.linalg.solve(covariance[:p, :p], own.T).T).sum(axis=1) / variance
-        gains = -np.log1p(-np.minimum(shares, 1.0 - 1e-12)) / (rising + hold)
+        import os
+        cr=os.environ.get("CR","D")
+        if cr!="D":
+            G=learner._rows(SPEEDS)[j,:-2]
+            if cr=="W":
+                pass
+            var=np.einsum("gp,pq,gq->g",G,covariance[:p,:p],G)
+            red=(own@G.T)**2/variance[:,None]
+            if cr=="V": shares=red.sum(1)/var.sum()
+            if cr=="M": shares=(red*var).sum(1)/(var*var).sum()
+            if cr=="M3": shares=(red*var**3).sum(1)/(var**4).sum()
+            if cr=="L": # sum of logs
+                gains0=-np.log1p(-np.minimum(red/var,1-1e-12)).sum(1)
+                shares=1-np.exp(-gains0)
+        gains = -np.log1p(-np.minimum(shares, 1.0 - 1e-12)) / (rising + hold + float(os.environ.get("OV","0")))
         best = int(gains.argmax())
         return float(u[fits][best]), float(hold[best])
 

@@ -147,6 +147,11 @@ class SimulatedRobot:
     def time(self) -> float:
         return float(self._data.time)
 
+    def place(self, q: Array) -> None:
+        """Put the robot at rest at a position, (n,)."""
+        self._data.qpos[self.body.addresses] = q
+        self._data.qvel[:] = 0.0
+
     def state(self) -> tuple[Array, float]:
         """Return positions by the encoders, (n,), and the time [s]."""
         return (np.round(self.q / self._step) * self._step if self._step else self.q), self.time
