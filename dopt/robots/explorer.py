@@ -43,8 +43,8 @@ FALSE_ALARM = 1e-8
 RECENT = 10
 """Windows whose innovations are compared with their intervals, and, from the 30th, are enough."""
 
-LIFTED = 40
-"""Windows from which a payload is estimated."""
+LIFTED = 2.0
+"""Seconds from which a payload is estimated, at least 10 windows."""
 
 LOST = 50
 """Measurements in turn that make no sense, after which the next is believed."""
@@ -152,9 +152,9 @@ class RobotExplorer:
         self.warnings: list[str] = []
         self.steps, self._wrong, self._asked = 0, 0, False
         self._measured = np.zeros(n)
-        self._rows: list[tuple[Array, Array]] = []
+        self._rows: list[tuple[Array, ...]] = []
         self._recent: deque[Array] = deque(maxlen=RECENT)
-        self._payload: list[tuple[Array, ...]] | None = None
+        self._payload: list[tuple[Any, ...]] | None = None
         self._done = False
         self._due: float | None = None
         self._alarm = _alarm(n)
@@ -214,7 +214,7 @@ class RobotExplorer:
         if self._wrong or not np.isfinite(torque).all():
             self._rows.clear()
             return
-        self._rows.append((self._measured, torque))
+        self._rows.append((self._measured, torque, self._v))
         if len(self._rows) == self.learner.window.size:
             if self._sensible(after, self._tracker.q + self.dt * self._tracker.v):
                 self._learn(after)
@@ -310,23 +310,12 @@ class RobotExplorer:
         covariance = learner.covariance[j]
         spread = X @ covariance
         variance = 1.0 / np.maximum(hold / learner.window.seconds - 0.5, 0.5) + (X * spread).sum(axis=1)
-        own = spread[:, :p]
-        shares = (own * np.linalg.solve(covariance[:p, :p], own.T).T).sum(axis=1) / variance
-        import os
-        cr=os.environ.get("CR","D")
-        if cr!="D":
-            G=learner._rows(SPEEDS)[j,:-2]
-            if cr=="W":
-                pass
-            var=np.einsum("gp,pq,gq->g",G,covariance[:p,:p],G)
-            red=(own@G.T)**2/variance[:,None]
-            if cr=="V": shares=red.sum(1)/var.sum()
-            if cr=="M": shares=(red*var).sum(1)/(var*var).sum()
-            if cr=="M3": shares=(red*var**3).sum(1)/(var**4).sum()
-            if cr=="L": # sum of logs
-                gains0=-np.log1p(-np.minimum(red/var,1-1e-12)).sum(1)
-                shares=1-np.exp(-gains0)
-        gains = -np.log1p(-np.minimum(shares, 1.0 - 1e-12)) / (rising + hold + float(os.environ.get("OV","0")))
+        # Variances of the curve, and what the segment takes from them; the widest count most.
+        curve = learner.rows(SPEEDS)[j, :-2]
+        before = ((curve @ covariance[:p, :p]) * curve).sum(axis=1)
+        taken = (spread[:, :p] @ curve.T) ** 2 / variance[:, None]
+        shares = taken @ before**3 / (before**4).sum()
+        gains = -np.log1p(-np.minimum(shares, 1.0 - 1e-12)) / (rising + hold)
         best = int(gains.argmax())
         return float(u[fits][best]), float(hold[best])
 
@@ -354,11 +343,12 @@ class RobotExplorer:
         v = -D.T @ (J * weighed).sum(axis=1)
         chosen = sphere_maximizer(Q, v, self._gamma, self._random.standard_normal(n))
         a = idle + inverse @ (chosen * limits.torque)
-        rest = tracker.q + tracker.v * np.abs(tracker.v) / (2.0 * self.acceleration)
-        outward = ((rest > self._high) & (tracker.v > 0)) | ((rest < self._low) & (tracker.v < 0))
-        fast = np.abs(tracker.v) > GUARDED * limits.velocity
+        after = tracker.v + self.dt * a
+        rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
+        outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
+        fast = np.abs(after) > GUARDED * limits.velocity
         brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
-        self._a = np.where(outward | (fast & (a * tracker.v > 0.0)), brake, a)
+        self._a = np.where(outward | fast, brake, a)
         demand = self.known.inverse(tracker.q, tracker.v, self._a) + friction
         self._q, self._v = tracker.q.copy(), tracker.v.copy()
         torque: Array = np.clip(demand, -limits.torque, limits.torque)
@@ -367,16 +357,19 @@ class RobotExplorer:
     # What a window teaches.
 
     def _learn(self, after: Array) -> None:
-        positions = np.array([*(q for q, _ in self._rows), after])
-        torques = np.array([*(u for _, u in self._rows), np.zeros(self.body.n)])
+        positions = np.array([*(row[0] for row in self._rows), after])
+        torques = np.array([*(row[1] for row in self._rows), np.zeros(self.body.n)])
+        rates = np.array([row[2] for row in self._rows]) if self.inputs == "references" else None
         means = self.learner.window.means(positions, torques)
         self.counts["windows"] += 1
         if self._payload is not None:
-            self._payload.append(means)
-            if len(self._payload) >= LIFTED:
+            self._payload.append((means, rates))
+            if len(self._payload) >= max(RECENT, LIFTED / self.learner.window.seconds):
                 self._lift(self._payload)
             return
-        self._recent.append(self.learner.learn(means) / np.sqrt(self.learner.inflation))
+        before = self.learner.torques(self._v)
+        self._recent.append(self.learner.learn(means, rates) / np.sqrt(self.learner.inflation))
+        self._q = self._q - self._tracker.lag(self.learner.torques(self._v) - before)
         if self._changed():
             self.counts["changed"] += 1
             text = (
@@ -399,26 +392,24 @@ class RobotExplorer:
         sums = np.where(known, recent, 0.0).sum(axis=0) ** 2 / np.maximum(known.sum(axis=0), 1)
         return bool(sums.sum() > self._alarm)
 
-    def _lift(self, windows: list[tuple[Array, ...]]) -> None:
+    def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
 
         Columns of the regressor, less friction and ripple as they are known, weighed by the noise.
         """
-        learner, n = self.learner, self.body.n
-        q, v, a, torque = (np.array(part) for part in zip(*windows, strict=True))
+        learner = self.learner
+        q, v, a = (np.array([means[i] for means, _ in windows]) for i in range(3))
         own = self.body.regressor(Motion(learner.window.seconds, q, v, a))[:, :, -10:-6]
-        missing, moving = np.empty((len(q), n)), np.empty((len(q), n), dtype=bool)
-        for t in range(len(q)):
-            e = learner.innovations((q[t], v[t], a[t], torque[t]))[0]
-            missing[t], moving[t] = np.nan_to_num(e), np.isfinite(e)
+        missing = np.array([learner.innovations(*window)[0] for window in windows])
+        moving = np.isfinite(missing)
         weights = moving / learner.noise
         design = own / self.limits.torque[:, None] * weights[..., None]
         found, *_ = np.linalg.lstsq(
-            design.reshape(-1, 4), (missing * weights).reshape(-1), rcond=1e-6
+            design.reshape(-1, 4), (np.nan_to_num(missing) * weights).reshape(-1), rcond=1e-6
         )
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
-        learner.forget(9.0)
+        learner.forget(100.0)
         text = f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3).tolist()} kg m"
         self.warnings.append(text)
         _log.warning(text)

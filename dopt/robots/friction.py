@@ -45,8 +45,8 @@ RIPPLE_SIZE = 1.5
 NOISE = 0.003
 """Standard deviation of a window's torque before any sample, as a part of the limit."""
 
-EXPECTED = 0.04
-"""Size of friction before any sample, as a part of the torque limit."""
+NEAR, EARLY = 1.4, 1.3
+"""Multiple of the width asked for from which the stop is near, and widening of intervals before."""
 
 BATCH = 10
 """Windows in a batch, whose means show how far innovations are correlated."""
@@ -111,12 +111,13 @@ class Network:
     """
 
     scales = np.array([100.0, 50.0, 25.0, 12.0, 5.0, 2.0, 0.7])
-    spread = np.concatenate([np.full(7, 0.06), np.full(7, 0.3), np.full(7, 0.1), [0.003]])
+    heights = [0.06, 0.015, 0.015, 0.015, 0.03, 0.06, 0.1]
+    spread = np.concatenate([heights, np.full(7, 0.15), np.full(7, 0.05), [0.003]])
 
     def __init__(self, n: int, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
         self.start = np.zeros((n, 22))
-        self.start[:, :7] = random.uniform(0.002, 0.01, (n, 7))
+        self.start[:, :7] = random.uniform(0.0005, 0.001, (n, 7))
         self.start[:, 7:14] = np.log(self.scales)
 
     def _units(self, parameters: Array, x: Array) -> tuple[Array, Array, Array, Array]:
@@ -242,9 +243,17 @@ class FrictionLearner:
         return np.maximum(1.0, self._batches[0] / self._batches[1])
 
     def torques(self, velocities: Array) -> Array:
-        """Return the friction learned so far [N m], (n,), at velocities (n,)."""
+        """Return friction to feed forward [N m], (n,), at velocities (n,).
+
+        It is what was learned, less its standard error: too much of it drives a joint too fast.
+        """
         x = (velocities / self.limits.velocity)[:, None]
-        result: Array = self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
+        parameters = self.mean[:, : self.p]
+        value = self.model.torques(parameters, x)[:, 0]
+        rows = self.model.jacobian(parameters, x)
+        variance = (rows @ self.covariance[:, : self.p, : self.p] * rows).sum(axis=(1, 2))
+        size = np.abs(value) - self.noise * np.sqrt(np.maximum(variance, 0.0))
+        result: Array = np.sign(value) * np.maximum(size, 0.0) * self.limits.torque
         return result
 
     def features(self, q: Array) -> Array:
@@ -252,16 +261,19 @@ class FrictionLearner:
         angles = q[..., None] * RIPPLE
         return np.concatenate([np.cos(angles), np.sin(angles)], axis=-1)
 
-    def innovations(self, means: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def innovations(
+        self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         """Return e, H and its prior variance in units of noise: (n,), (n, d) and (n,).
 
-        Where a joint is too slow, e is NaN and H zero.
+        Where a joint is too slow, e is NaN and H zero. The arguments are those of :meth:`learn`.
         """
         q, v, a, torque = means
-        x, slope = v / self.limits.velocity, a / self.limits.velocity
-        half = np.abs(slope) * self.window.times[-1]
-        moving = np.abs(x) - half > SLOW
-        within = x[:, None] + slope[:, None] * self.window.times[1:-1]
+        times, limit = self.window.times[1:-1], self.limits.velocity
+        within = (v + times[:, None] * a) / limit
+        x = within if rates is None else rates[1:] / limit
+        moving = (np.abs(x).min(axis=0) > SLOW) & (np.abs(np.sign(x).sum(axis=0)) == len(x))
+        within = within.T
         weights = self.window.weights[1:-1]
         parameters = self.mean[:, : self.p]
         mean = self.model.torques(parameters, within) @ weights
@@ -277,9 +289,20 @@ class FrictionLearner:
         result: Array = np.squeeze(self.covariance @ rows[..., None], 2)
         return result
 
-    def learn(self, means: tuple[Array, Array, Array, Array]) -> Array:
-        """Learn from a window; return its standardised innovations, (n,), NaN where it is slow."""
-        missing, rows, variance = self.innovations(means)
+    def learn(
+        self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
+    ) -> Array:
+        """Learn from a window; return its standardised innovations, (n,), NaN where it is slow.
+
+        Parameters
+        ----------
+        means : tuple of (n,)
+            As :meth:`Window.means` returns them.
+        rates : (N, n), optional
+            Velocities of the reference, which tell whether a joint is too slow: measured ones are
+            the lower, the larger the noise was, and leave a biased choice of windows.
+        """
+        missing, rows, variance = self.innovations(means, rates)
         moving = np.isfinite(missing)
         error = np.where(moving, missing, 0.0)
         standard = error / np.sqrt(1.0 + variance)
@@ -309,7 +332,7 @@ class FrictionLearner:
         self.covariance[:, p:, :p] *= shrink[:, None, :]
         self._expected = None
 
-    def _rows(self, speeds: Array) -> Array:
+    def rows(self, speeds: Array) -> Array:
         """Return the gradients of the curve at speeds, and of the two constants, (n, k + 2, p).
 
         The constants of a network are the line through the curve at half of the limit and at it.
@@ -335,7 +358,7 @@ class FrictionLearner:
 
     def deviations(self, speeds: Array = SPEEDS) -> Array:
         """Return standard errors as parts of the torque limit, (n, k + 2), as :meth:`intervals`."""
-        rows = self._rows(speeds)
+        rows = self.rows(speeds)
         block = self.covariance[:, : self.p, : self.p]
         variance = np.einsum("nkp,npq,nkq->nk", rows, block, rows)
         scale = self.noise * np.sqrt(self.inflation)
@@ -354,35 +377,34 @@ class FrictionLearner:
         """Return the root mean square of each joint's curve, (n,), as a part of the limit."""
         return np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
 
-    def _information(self, values: Array, errors: Array) -> Array:
-        """Return the information expected at the stop, (n, 14).
+    def _information(self, values: Array, errors: Array) -> Array | None:
+        """Return the information expected at the stop, (n, 14), None until it is near.
 
-        It is fixed once the curves are known to a fifth of their sizes; a first guess comes before.
+        It is fixed once the widest interval of each curve takes half as much information again.
         """
-        if self._expected is not None:
-            return self._expected
-        sizes = np.sqrt((values[:, :-2] ** 2).mean(axis=1))
-        widest = errors[:, :-2].max(axis=1)
-        known = bool((widest < 0.2 * sizes).all())
-        half = self.relative * (sizes if known else np.full(self.n, EXPECTED))
-        expected: Array = (self.boundary * widest / half)[:, None] ** 2 / errors**2
-        if known:
-            self._expected = expected
-        return expected
+        if self._expected is None:
+            sizes = np.sqrt((values[:, :-2] ** 2).mean(axis=1))
+            widest = self.boundary * errors[:, :-2].max(axis=1)
+            if not (widest < NEAR * self.relative * sizes).all():
+                return None
+            self._expected = 1.1 / errors**2
+        return self._expected
 
     def curve(self, joint: int, velocities: Array) -> tuple[Array, Array, Array]:
         """Return friction [N m] and the ends of its intervals, each (k,), at velocities (k,)."""
         unit, x = self.limits.torque[joint], np.asarray(velocities) / self.limits.velocity[joint]
         values, errors = self._values(x)[joint, :-2], self.deviations(x)[joint, :-2]
-        known = self._information(self._values(SPEEDS), self.deviations())[joint, :-2]
-        speeds = np.log(np.clip(np.abs(x), SPEEDS[0], SPEEDS[-1]))
-        expected = np.exp(np.interp(speeds, np.log(SPEEDS), np.log(known)))
+        expected = self._information(self._values(SPEEDS), self.deviations())
+        if expected is not None:
+            speeds = np.log(np.clip(np.abs(x), SPEEDS[0], SPEEDS[-1]))
+            known = np.log(expected[joint, :-2])
+            expected = np.exp(np.interp(speeds, np.log(SPEEDS), known))
         half = half_widths(errors, expected, self.boundary)
         return values * unit, (values - half) * unit, (values + half) * unit
 
 
 def window_size(inertia: Array, limits: Limits, dt: float) -> int:
-    """Return the periods after which errors of encoders add a fifth to the noise of torques.
+    """Return the periods after which errors of encoders add a half to the noise of torques.
 
     Least squares over N periods leave σ √(720/N⁵)/dt² in an acceleration, and 1.2 σ/√N in a torque.
 
@@ -391,7 +413,7 @@ def window_size(inertia: Array, limits: Limits, dt: float) -> int:
     inertia : (n,)
         Largest inertia of each joint [kg m²].
     """
-    size = 720.0 * (inertia / limits.torque * ENCODER / (dt**2 * TORQUE_NOISE)) ** 2 / (0.2 * 1.43)
+    size = 720.0 * (inertia / limits.torque * ENCODER / (dt**2 * TORQUE_NOISE)) ** 2 / (0.5 * 1.43)
     return int(np.clip(2 * np.ceil(size.max() ** 0.25 / 2), *WINDOW))
 
 
@@ -410,8 +432,13 @@ def boundary(level: float) -> float:
     )
 
 
-def half_widths(errors: Array, expected: Array, a: float) -> Array:
-    """Return half-widths that hold at all times, of standard errors and information expected."""
+def half_widths(errors: Array, expected: Array | None, a: float) -> Array:
+    """Return half-widths that hold at all times, of standard errors and information expected.
+
+    Before that is known, they are wider by :data:`EARLY`.
+    """
+    if expected is None:
+        return EARLY * a * errors
     information = 1.0 / np.maximum(errors, 1e-300) ** 2
     later = np.sqrt((a**2 + np.log(np.maximum(information / expected, 1.0))) / information)
     result: Array = np.where(information < expected, a * np.sqrt(expected) / information, later)

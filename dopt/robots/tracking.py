@@ -115,6 +115,14 @@ class Tracker:
         result: Array = np.clip(demand, -self.limits.torque, self.limits.torque)
         return result
 
+    def lag(self, torque: Array) -> Array:
+        """Return the error of position, (n,), that feeds back a torque [N m], (n,).
+
+        A reference that is moved back by what a better feedforward makes up for does not hurry.
+        """
+        result: Array = np.linalg.solve(self.known.mass_matrix(), torque) / BANDWIDTH**2
+        return result
+
 
 def possible_acceleration(
     known: KnownBody, limits: Limits, share: float = 0.7

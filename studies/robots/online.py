@@ -139,7 +139,8 @@ def track(robot: SimulatedRobot, motion: Motion, learner: FrictionLearner) -> Tr
         if len(rows) == learner.window.size:
             positions = np.array([*(p for p, _ in rows), q])
             torques = np.array([*(u for _, u in rows), 0.0 * q])
-            learner.learn(learner.window.means(positions, torques))
+            rates = motion.velocities[k - len(rows) : k]
+            learner.learn(learner.window.means(positions, torques), rates)
             rows = []
         previous = motion.accelerations[k]
         torque = tracker.torque(motion.positions[k], motion.velocities[k], previous)

@@ -24,8 +24,10 @@ FINER = 4
 SMOOTH = 0.002
 """Width in which dry friction changes its sign, as a part of the velocity limit."""
 
-ROTOR = 0.1
-"""Armature [kg m²] of the iiwa, which its URDF leaves out: as in MuJoCo Menagerie's iiwa 14."""
+ROTOR = 0.0025
+"""Armature of the iiwa [kg m²] by N m of the torque limit, which its URDF leaves out.
+
+It makes 0.1 kg m² of the wrist, as in MuJoCo Menagerie's iiwa 14, and more of larger drives."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,19 +67,24 @@ class Friction:
         result: Array = dry * np.tanh(velocities / self.smooth) + self.viscous * velocities
         return result
 
-    def slopes(self, velocities: Array) -> Array:
-        """Return f(v)/v, (n,), positive and bounded."""
-        away = np.where(np.abs(velocities) < 1e-9, 1e-9, velocities)
-        result: Array = self.torques(away) / away
-        return result
+    def implicit(self, velocities: Array) -> tuple[Array, Array]:
+        """Return b and d ≥ 0, (n,), with f ≈ b + d v' for the velocity v' after a short step.
+
+        A tangent where friction is smooth; near rest a chord through zero, which does not chatter.
+        """
+        v, near = velocities, np.abs(velocities) < 5.0 * self.smooth
+        f = self.torques(v)
+        chord = f / np.where(np.abs(v) < 1e-9, 1e-9, v)
+        chord = np.where(np.abs(v) < 1e-9, (self.coulomb + self.stribeck) / self.smooth, chord)
+        d = np.where(near, chord, self.viscous)
+        return f - d * v, d
 
 
 class SimulatedRobot:
     """Robot in MuJoCo with hidden friction, noisy torques and encoders, at 500 Hz.
 
     Contacts, limits of joints, and the friction and damping of the file are off. Friction enters
-    the implicit integration as damping f(v)/v, which does not chatter; four steps of the engine in
-    a period of control keep its error small.
+    the implicit integration as damping, with four steps of the engine in a period of control.
 
     Parameters
     ----------
@@ -166,9 +173,10 @@ class SimulatedRobot:
         applied = np.clip(torque, -self.limits.torque, self.limits.torque)
         applied = applied + noise * self._random.standard_normal(self.body.n)
         applied += ripple * np.sin(self._periods * self.q + self._phases)
-        data.qfrc_applied[dofs] = applied
         for _ in range(FINER):
-            self._model.dof_damping[dofs] = self.friction.slopes(data.qvel[dofs])
+            constant, damping = self.friction.implicit(data.qvel[dofs])
+            self._model.dof_damping[dofs] = damping
+            data.qfrc_applied[dofs] = applied - constant
             mujoco.mj_step(self._model, data)
 
     def _take(self, mass: float) -> None:
@@ -191,8 +199,9 @@ class SimulatedRobot:
 def iiwa(urdf: Path, limits: Path) -> tuple[Body, Limits]:
     """Return KUKA's iiwa 7, by the URDF of pybullet with rotors, and a file of its true limits."""
     body = Body.load(urdf)
-    body.model.dof_armature[:] = ROTOR
-    return body, Limits.of(body, limits)
+    known = Limits.of(body, limits)
+    body.model.dof_armature[body.dofs] = ROTOR * known.torque
+    return body, known
 
 
 def jaco() -> tuple[Body, Limits]:
