@@ -387,7 +387,7 @@ class FrictionLearner:
             widest = self.boundary * errors[:, :-2].max(axis=1)
             if not (widest < NEAR * self.relative * sizes).all():
                 return None
-            self._expected = 1.1 / errors**2
+            self._expected = 1.25 / errors**2
         return self._expected
 
     def curve(self, joint: int, velocities: Array) -> tuple[Array, Array, Array]:

@@ -16,12 +16,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from dopt.robots.body import Body, Motion
+from dopt.robots.design import Problem, searched
+from dopt.robots.design import multisine as multisine_of
 from dopt.robots.explorer import RobotExplorer
 from dopt.robots.friction import SPEEDS, FrictionLearner, window_size
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.trajectories import Family, Fourier, Ladder, Multisine
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, SimulatedRobot, iiwa, jaco
 
@@ -29,6 +33,9 @@ FILE = Path("docs/robots_online.csv")
 
 LOOK = 50
 """Periods of control from one comparison with the truth to the next."""
+
+EFFORT = 200
+"""Motions that the search of each family tries."""
 
 CLOSE = 0.05
 """Root mean square error of a friction curve relative to its own, that counts as learned."""
@@ -161,3 +168,188 @@ def resampled(motion: Motion) -> Motion:
 
     parts = (motion.positions, motion.velocities, motion.accelerations)
     return Motion(CONTROL, *(at(part) for part in parts))
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """Measured quantity of one run, or of all runs of a case."""
+
+    part: str
+    arm: str
+    case: str
+    seed: int
+    quantity: str
+    value: float
+
+
+def coverage(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
+    """Stop at 5 % and look which intervals hold, and how wide they are beside fixed-time ones."""
+    for seed in seeds:
+        robot = SimulatedRobot(body, limits, seed)
+        explorer = RobotExplorer(body, limits, stop={"curve": CLOSE}, seed=seed)
+        trace = explore(robot, explorer, 40.0, until_done=True)
+        values, half = explorer.learner.intervals()
+        held = np.abs(values - true_values(robot)) <= half
+        ratio = half / (1.96 * explorer.learner.deviations())
+        found = {
+            "stopped": float(explorer.done),
+            "seconds": robot.time,
+            "held: curve": held[:, :-2].mean(),
+            "held: Coulomb": held[:, -2].mean(),
+            "held: viscous": held[:, -1].mean(),
+            "width beside a fixed time's: curve": np.median(ratio[:, :-2]),
+            "width beside a fixed time's: constants": np.median(ratio[:, -2:]),
+            "false alarms": explorer.counts["changed"],
+            **{f"share of limit: {kind}": share for kind, share in trace.shares.items()},
+        }
+        for quantity, value in found.items():
+            yield Row("coverage", name, "at the stop", seed, quantity, float(value))
+
+
+def times(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
+    """Time until every joint's curve stays within 5 %, online and by motions designed before."""
+    seconds = 10.0
+    for friction, label in (("coulomb_viscous", "online"), ("network", "online, network")):
+        for seed in seeds:
+            robot = SimulatedRobot(body, limits, seed)
+            explorer = RobotExplorer(body, limits, friction=friction, seed=seed)
+            yield from _settled(name, label, seed, explore(robot, explorer, seconds))
+    designs = dict(_designs(body, limits, seconds))
+    multisine = Multisine(limits, seconds)
+    for seed in seeds:
+        numbers = np.random.default_rng(seed).standard_normal(multisine.size)
+        motions = {"random multisine": multisine.motion(numbers, CONTROL), **designs}
+        for label, motion in motions.items():
+            robot = SimulatedRobot(body, limits, seed)
+            trace = track(robot, motion, learner_of(robot))
+            yield from _settled(name, label, seed, trace)
+
+
+def _designs(body: Body, limits: Limits, seconds: float) -> Iterator[tuple[str, Motion]]:
+    """Yield the motions designed for friction before the run, each the best of many."""
+    problem = Problem(body, limits, "damping,frictionloss", seconds, nuisance="")
+    random = np.random.default_rng(0)
+    yield "multisine, best of 25", multisine_of(problem, random).motion(CONTROL)
+    periods = (2.0, 5.0, 10.0)
+    families: list[Family] = [Fourier(limits, seconds, period) for period in periods]
+    for family in families:
+        yield family.name, searched(problem, family, random, EFFORT).motion(CONTROL)
+    ladder = Ladder(limits, seconds)
+    plain = random.standard_normal((10, ladder.size))
+    yield (
+        "ladder, best of 10",
+        min((problem.candidate(ladder, x) for x in plain), key=lambda one: one.score).motion(
+            CONTROL
+        ),
+    )
+    yield "D-optimal ladder", searched(problem, ladder, random, EFFORT).motion(CONTROL)
+
+
+def _settled(name: str, label: str, seed: int, trace: Trace) -> Iterator[Row]:
+    found = {
+        "seconds to 5 %": trace.settled(),
+        "seconds to 5 %: constants": trace.settled("constants"),
+        "error at the end": float(np.max(trace.errors[-1])),
+        **{f"share of limit: {kind}": share for kind, share in trace.shares.items()},
+    }
+    for quantity, value in found.items():
+        yield Row("times", name, label, seed, quantity, float(value))
+
+
+def payload(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
+    """Hang a mass on the last body after 6 s, 5 % of the arm's, and see what is said of it."""
+    mass = 0.05 * float(body.model.body_mass.sum())
+    for seed in seeds:
+        robot = SimulatedRobot(body, limits, seed, payload=(6.0, mass))
+        explorer = RobotExplorer(body, limits, seed=seed)
+        before = float(explorer.known.model.body_mass[body.moved[-1]])
+        noticed = np.inf
+        trace, q = Trace(), robot.state()[0]
+        for k in range(9000):
+            torque = explorer.ask(q)
+            robot.step(torque)
+            q, now = robot.state()
+            explorer.tell(q, torque)
+            trace.measure(robot, torque)
+            if explorer.counts["changed"] and noticed == np.inf:
+                noticed = now
+            if k % LOOK == LOOK - 1:
+                trace.look(robot, explorer.learner)
+        values, half = explorer.learner.intervals()
+        after = float(explorer.known.model.body_mass[body.moved[-1]])
+        found = {
+            "seconds until noticed": noticed - 6.0,
+            "said": explorer.counts["changed"],
+            "mass [kg]": mass,
+            "estimated mass [kg]": after - before,
+            "held: curve": (np.abs(values - true_values(robot)) <= half)[:, :-2].mean(),
+            "error at the end": float(np.max(trace.errors[-1])),
+            **{f"share of limit: {kind}": share for kind, share in trace.shares.items()},
+        }
+        for quantity, value in found.items():
+            yield Row("payload", name, f"{mass:.2f} kg", seed, quantity, float(value))
+
+
+def steps(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
+    """Processor time of a step beside the engine, the mean of 2,000."""
+    for seed in seeds:
+        for inputs in ("references", "torques"):
+            for friction in ("coulomb_viscous", "network"):
+                robot = SimulatedRobot(body, limits, seed)
+                explorer = RobotExplorer(body, limits, inputs=inputs, friction=friction, seed=seed)
+                spent, q = [0.0, 0.0], robot.state()[0]
+                for _ in range(2000):
+                    began = time.thread_time()
+                    torque = explorer.ask(q)
+                    asked = time.thread_time()
+                    robot.step(torque)
+                    q = robot.state()[0]
+                    told = time.thread_time()
+                    explorer.tell(q, torque)
+                    spent[0] += asked - began
+                    spent[1] += time.thread_time() - told
+                for what, total in zip(("ask", "tell"), spent, strict=True):
+                    quantity = f"{what}: milliseconds of processor time a step"
+                    yield Row("steps", name, f"{inputs}, {friction}", seed, quantity, total / 2.0)
+
+
+PARTS = {"coverage": coverage, "times": times, "payload": payload, "steps": steps}
+
+
+def main() -> None:
+    """Measure a part on both arms, and append its rows."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=PARTS)
+    parser.add_argument("--urdf", type=Path, help="model of the iiwa; without it, the other arm")
+    parser.add_argument("--limits", type=Path, help="limits of the iiwa")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--arm", choices=("iiwa", "jaco"), help="one arm alone")
+    parser.add_argument("--out", type=Path, default=FILE)
+    given = parser.parse_args()
+    arms = {"jaco": jaco()}
+    if given.urdf and given.limits:
+        arms["iiwa"] = iiwa(given.urdf, given.limits)
+    fresh = not given.out.exists()
+    with given.out.open("a", newline="") as file:
+        writer = csv.writer(file)
+        if fresh:
+            writer.writerow([field.name for field in dataclasses.fields(Row)])
+        for name, (body, limits) in arms.items():
+            if given.arm in (None, name):
+                seeds = range(given.first, given.first + given.seeds)
+                for row in PARTS[given.part](name, body, limits, seeds):
+                    writer.writerow([*dataclasses.astuple(row)[:-1], f"{row.value:.6g}"])
+                    file.flush()
+    summary(given.out, given.part)
+
+
+def summary(file: Path, part: str) -> None:
+    """Print the median, the mean and the worst of each quantity."""
+    table = pd.read_csv(file)
+    rows = table[table.part == part].groupby(["arm", "case", "quantity"]).value
+    sys.stdout.write(rows.agg(["count", "median", "mean", "min", "max"]).to_string() + "\n")
+
+
+if __name__ == "__main__":
+    main()
