@@ -34,7 +34,7 @@ FILE = Path("docs/robots_online.csv")
 LOOK = 50
 """Periods of control from one comparison with the truth to the next."""
 
-EFFORT = 200
+EFFORT = 100
 """Motions that the search of each family tries."""
 
 CLOSE = 0.05
@@ -208,7 +208,7 @@ def coverage(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Ro
 
 def times(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
     """Time until every joint's curve stays within 5 %, online and by motions designed before."""
-    seconds = 10.0
+    seconds = 8.0
     for friction, label in (("coulomb_viscous", "online"), ("network", "online, network")):
         for seed in seeds:
             robot = SimulatedRobot(body, limits, seed)
