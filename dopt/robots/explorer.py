@@ -1,4 +1,4 @@
-"""Exploration of a robot whose body is known: it moves, learns friction, and stops when asked to."""
+"""Exploration of a robot whose body is known: it moves, learns friction, and stops when told."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ import numpy.typing as npt
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
 from dopt.robots.body import Body, Motion
-from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner, window_size
+from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.windows import window_size
 from dopt.sphere import sphere_maximizer
 from dopt.types import Array
 
@@ -67,8 +68,8 @@ class RobotExplorer:
 
     With ``inputs="references"``, each joint moves with constant speeds and bounded accelerations,
     tracked by computed torque with the friction learned so far. The next speed of a joint is the
-    one with the largest gain of ln det of its friction's information a second (D_s-optimal: ripple
-    is a nuisance). With ``inputs="torques"``, the torques of each period are the paper's step.
+    one that narrows the widest intervals of its friction curve most, a second; ripple is a nuisance.
+    With ``inputs="torques"``, the torques of each period are the paper's D-optimal step.
 
     Parameters
     ----------
@@ -309,7 +310,9 @@ class RobotExplorer:
         X = np.concatenate([rows, features], axis=1)
         covariance = learner.covariance[j]
         spread = X @ covariance
-        variance = 1.0 / np.maximum(hold / learner.window.seconds - 0.5, 0.5) + (X * spread).sum(axis=1)
+        variance = 1.0 / np.maximum(hold / learner.window.seconds - 0.5, 0.5) + (X * spread).sum(
+            axis=1
+        )
         # Variances of the curve, and what the segment takes from them; the widest count most.
         curve = learner.rows(SPEEDS)[j, :-2]
         before = ((curve @ covariance[:p, :p]) * curve).sum(axis=1)
@@ -409,7 +412,7 @@ class RobotExplorer:
         )
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
-        learner.forget(100.0)
+        learner.forget(10.0)
         text = f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3).tolist()} kg m"
         self.warnings.append(text)
         _log.warning(text)

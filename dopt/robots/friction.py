@@ -4,31 +4,20 @@ What is learned is the missing torque τ - ID(q, q̇, q̈) of each joint as a fu
 the information is one block a joint. Torques are learned as parts x of the torque limit, rates as
 parts of the velocity limit. Torque that depends on the position (ripple) is a nuisance: a random
 function with 10 to 40 periods a turn, whose coefficients are learned and told apart from friction.
-
-An interval holds at all times at once: normal mixture with a delayed start, H. Robbins, "Statistical
-methods related to the law of the iterated logarithm", Ann. Math. Stat. 41, 5 (1970); S. R. Howard,
-A. Ramdas, J. McAuliffe and J. Sekhon, Ann. Stat. 49, 2 (2021); for one of several coefficients
-M. Lindon et al., "Anytime-valid linear models" (arXiv:2210.08589). The inputs depend on what was
-learned, which the last one does not cover: `studies/robots/online.py` measures the coverage.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
 
 from dopt.errors import unknown_name
 from dopt.robots.limits import Limits
+from dopt.robots.windows import WINDOW, Window, boundary, half_widths
 from dopt.types import Array
-
-WINDOW = 20, 100
-"""Least and most periods of control in a window, whose samples become one equation a joint."""
-
-ENCODER, TORQUE_NOISE = 2.8e-5, 0.01
-"""Errors that are expected of a position [rad], 16 bits, and of a torque, as a part of its limit."""
 
 SLOW = 0.01
 """Windows in which a joint is slower than this part of its limit teach nothing of its friction."""
@@ -45,8 +34,8 @@ RIPPLE_SIZE = 1.5
 NOISE = 0.003
 """Standard deviation of a window's torque before any sample, as a part of the limit."""
 
-NEAR, EARLY = 1.4, 1.3
-"""Multiple of the width asked for from which the stop is near, and widening of intervals before."""
+NEAR = 1.4
+"""Multiple of the width asked for from which the stop is near."""
 
 BATCH = 10
 """Windows in a batch, whose means show how far innovations are correlated."""
@@ -111,7 +100,7 @@ class Network:
     """
 
     scales = np.array([100.0, 50.0, 25.0, 12.0, 5.0, 2.0, 0.7])
-    heights = [0.06, 0.015, 0.015, 0.015, 0.03, 0.06, 0.1]
+    heights = (0.06, 0.015, 0.015, 0.015, 0.03, 0.06, 0.1)
     spread = np.concatenate([heights, np.full(7, 0.15), np.full(7, 0.05), [0.003]])
 
     def __init__(self, n: int, seed: int = 0) -> None:
@@ -144,38 +133,11 @@ class Network:
         return (c * bent * s).sum(axis=2), rows
 
 
-FRICTION = {"coulomb_viscous": lambda n, seed: CoulombViscous(n), "network": Network}  # noqa: ARG005
-
-
-class Window:
-    """Weights that make one equation of the samples of a window.
-
-    A second-order polynomial through the positions q_0 … q_N by least squares has an acceleration
-    c·q, which is also Σ w_i q̈_i over second differences. Torques, positions and rates averaged by
-    the same w obey the same equation of motion.
-    """
-
-    def __init__(self, dt: float, size: int = WINDOW[0]) -> None:
-        t = dt * (np.arange(size + 1) - size / 2)
-        self.acceleration = np.linalg.pinv(np.stack([np.ones_like(t), t, t**2 / 2], axis=1))[2]
-        self.weights = np.zeros(size + 1)
-        self.weights[1:-1] = dt**2 * np.cumsum(np.cumsum(self.acceleration))[:-2]
-        # A torque acts until the next sample: half of it in each of two second differences.
-        self.of_torques = np.zeros(size + 1)
-        self.of_torques[:-1] = 0.5 * (self.weights[:-1] + self.weights[1:])
-        rates = np.zeros(size + 1)
-        rates[2:] += self.weights[1:-1] / (2 * dt)
-        rates[:-2] -= self.weights[1:-1] / (2 * dt)
-        self.rate, self.times, self.size, self.seconds = rates, t, size, size * dt
-
-    def means(self, positions: Array, torques: Array) -> tuple[Array, Array, Array, Array]:
-        """Return position, rate, acceleration and torque, each (n,), of samples (N + 1, n)."""
-        return (
-            self.weights @ positions,
-            self.rate @ positions,
-            self.acceleration @ positions,
-            self.of_torques @ torques,
-        )
+FRICTION: Mapping[str, Callable[[int, int], FrictionModel]] = {
+    "coulomb_viscous": lambda n, _: CoulombViscous(n),
+    "network": Network,
+}
+"""Models of friction, by their names, of n joints and a seed."""
 
 
 class FrictionLearner:
@@ -240,7 +202,8 @@ class FrictionLearner:
     @property
     def inflation(self) -> Array:
         """Variance of means of innovations relative to uncorrelated ones, (n,), at least 1."""
-        return np.maximum(1.0, self._batches[0] / self._batches[1])
+        result: Array = np.maximum(1.0, self._batches[0] / self._batches[1])
+        return result
 
     def torques(self, velocities: Array) -> Array:
         """Return friction to feed forward [N m], (n,), at velocities (n,).
@@ -289,9 +252,7 @@ class FrictionLearner:
         result: Array = np.squeeze(self.covariance @ rows[..., None], 2)
         return result
 
-    def learn(
-        self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
-    ) -> Array:
+    def learn(self, means: tuple[Array, Array, Array, Array], rates: Array | None = None) -> Array:
         """Learn from a window; return its standardised innovations, (n,), NaN where it is slow.
 
         Parameters
@@ -319,42 +280,19 @@ class FrictionLearner:
         return result
 
     def forget(self, factor: float) -> None:
-        """Widen what is known of friction: the body that it was learned with has changed."""
-        p = self.p
-        wide = self._prior[:p, :p]
-        self.covariance[:, :p, p:] *= math.sqrt(factor)
-        self.covariance[:, p:, :p] *= math.sqrt(factor)
-        self.covariance[:, :p, :p] *= factor
-        over = np.diagonal(self.covariance[:, :p, :p], axis1=1, axis2=2) > np.diag(wide)
-        shrink = np.where(over, 0.5, 1.0)
-        self.covariance[:, :p, :p] *= shrink[:, :, None] * shrink[:, None, :]
-        self.covariance[:, :p, p:] *= shrink[:, :, None]
-        self.covariance[:, p:, :p] *= shrink[:, None, :]
+        """Multiply the errors of friction: the body that it was learned with has changed."""
+        self.covariance[:, : self.p] *= factor
+        self.covariance[:, :, : self.p] *= factor
         self._expected = None
 
     def rows(self, speeds: Array) -> Array:
-        """Return the gradients of the curve at speeds, and of the two constants, (n, k + 2, p).
-
-        The constants of a network are the line through the curve at half of the limit and at it.
-        """
+        """Return the gradients of the curve at speeds, and of the two constants, (n, k + 2, p)."""
         x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
-        rows = self.model.jacobian(self.mean[:, : self.p], x)
-        if isinstance(self.model, CoulombViscous):
-            rows[:, -2:] = np.eye(2, self.p)
-        else:
-            half, full = rows[:, -2].copy(), rows[:, -1].copy()
-            rows[:, -2], rows[:, -1] = 2.0 * half - full, 2.0 * (full - half)
-        return rows
+        return _with_constants(self.model.jacobian(self.mean[:, : self.p], x))
 
     def _values(self, speeds: Array) -> Array:
-        parameters = self.mean[:, : self.p]
         x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
-        values = self.model.torques(parameters, x)
-        half, full = values[:, -2].copy(), values[:, -1].copy()
-        values[:, -2], values[:, -1] = 2.0 * half - full, 2.0 * (full - half)
-        if isinstance(self.model, CoulombViscous):
-            values[:, -2:] = parameters[:, :2]
-        return values
+        return _with_constants(self.model.torques(self.mean[:, : self.p], x))
 
     def deviations(self, speeds: Array = SPEEDS) -> Array:
         """Return standard errors as parts of the torque limit, (n, k + 2), as :meth:`intervals`."""
@@ -371,21 +309,21 @@ class FrictionLearner:
         The columns are the curve at ``SPEEDS``, Coulomb friction, and viscous at full velocity.
         """
         values, errors = self._values(SPEEDS), self.deviations()
-        return values, half_widths(errors, self._information(values, errors), self.boundary)
+        return values, half_widths(errors, self._information(errors), self.boundary)
 
     def sizes(self) -> Array:
         """Return the root mean square of each joint's curve, (n,), as a part of the limit."""
-        return np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
+        result: Array = np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
+        return result
 
-    def _information(self, values: Array, errors: Array) -> Array | None:
+    def _information(self, errors: Array) -> Array | None:
         """Return the information expected at the stop, (n, 14), None until it is near.
 
         It is fixed once the widest interval of each curve takes half as much information again.
         """
         if self._expected is None:
-            sizes = np.sqrt((values[:, :-2] ** 2).mean(axis=1))
             widest = self.boundary * errors[:, :-2].max(axis=1)
-            if not (widest < NEAR * self.relative * sizes).all():
+            if not (widest < NEAR * self.relative * self.sizes()).all():
                 return None
             self._expected = 1.25 / errors**2
         return self._expected
@@ -394,7 +332,7 @@ class FrictionLearner:
         """Return friction [N m] and the ends of its intervals, each (k,), at velocities (k,)."""
         unit, x = self.limits.torque[joint], np.asarray(velocities) / self.limits.velocity[joint]
         values, errors = self._values(x)[joint, :-2], self.deviations(x)[joint, :-2]
-        expected = self._information(self._values(SPEEDS), self.deviations())
+        expected = self._information(self.deviations())
         if expected is not None:
             speeds = np.log(np.clip(np.abs(x), SPEEDS[0], SPEEDS[-1]))
             known = np.log(expected[joint, :-2])
@@ -403,46 +341,14 @@ class FrictionLearner:
         return values * unit, (values - half) * unit, (values + half) * unit
 
 
-def window_size(inertia: Array, limits: Limits, dt: float) -> int:
-    """Return the periods after which errors of encoders add a half to the noise of torques.
+def _with_constants(columns: Array) -> Array:
+    """Replace the last two columns, at half of the velocity limit and at it, by two constants.
 
-    Least squares over N periods leave σ √(720/N⁵)/dt² in an acceleration, and 1.2 σ/√N in a torque.
-
-    Parameters
-    ----------
-    inertia : (n,)
-        Largest inertia of each joint [kg m²].
+    Coulomb and viscous friction are the line through them: Stribeck friction is over there.
     """
-    size = 720.0 * (inertia / limits.torque * ENCODER / (dt**2 * TORQUE_NOISE)) ** 2 / (0.5 * 1.43)
-    return int(np.clip(2 * np.ceil(size.max() ** 0.25 / 2), *WINDOW))
-
-
-def boundary(level: float) -> float:
-    """Return a with 4 (1 - Φ(a)) + 2 a φ(a) = level.
-
-    |S| ≤ a √m until the information I reaches m, and |S| ≤ √(I (a² + ln(I/m))) ever after, are
-    together kept with probability 1 - level by a sum S of variance I: Robbins (1970) from m on,
-    and by reflection before.
-    """
-    from scipy.optimize import brentq
-    from scipy.stats import norm
-
-    return float(
-        brentq(lambda a: 4.0 * norm.sf(a) + 2.0 * a * norm.pdf(a) - level, 1.0, 9.0, xtol=1e-9)
-    )
-
-
-def half_widths(errors: Array, expected: Array | None, a: float) -> Array:
-    """Return half-widths that hold at all times, of standard errors and information expected.
-
-    Before that is known, they are wider by :data:`EARLY`.
-    """
-    if expected is None:
-        return EARLY * a * errors
-    information = 1.0 / np.maximum(errors, 1e-300) ** 2
-    later = np.sqrt((a**2 + np.log(np.maximum(information / expected, 1.0))) / information)
-    result: Array = np.where(information < expected, a * np.sqrt(expected) / information, later)
-    return result
+    half, full = columns[:, -2].copy(), columns[:, -1].copy()
+    columns[:, -2], columns[:, -1] = 2.0 * half - full, 2.0 * (full - half)
+    return columns
 
 
 __all__ = [
@@ -452,8 +358,4 @@ __all__ = [
     "FrictionLearner",
     "FrictionModel",
     "Network",
-    "Window",
-    "boundary",
-    "half_widths",
-    "window_size",
 ]

@@ -90,8 +90,8 @@ class Tracker:
         self, known: KnownBody, limits: Limits, friction: Callable[[Array], Array], dt: float
     ) -> None:
         self.known, self.limits, self.friction, self.dt = known, limits, friction, dt
-        self.q = np.array(known.body.home)
-        self.v = np.zeros(len(self.q))
+        self.q: Array = np.array(known.body.home)
+        self.v: Array = np.zeros(len(self.q))
 
     def place(self, q: Array) -> None:
         """Begin at rest at a position, (n,)."""
@@ -133,7 +133,8 @@ def possible_acceleration(
     """
     random, n = np.random.default_rng(0), len(limits.torque)
     least, largest = np.array(limits.acceleration, dtype=float), np.zeros(n)
-    for q in random.uniform(*limits.position.T, (200, n)):
+    low, high = limits.position.T
+    for q in low + (high - low) * random.random((200, n)):
         held = np.abs(known.inverse(q, np.zeros(n), np.zeros(n)))
         own = np.diag(known.mass_matrix())
         least = np.minimum(least, np.maximum(share * limits.torque - held, 0.0) / own)

@@ -210,7 +210,8 @@ def jaco() -> tuple[Body, Limits]:
     Accelerations are what the torques leave with the armature in the file.
     """
     spec = importlib.util.find_spec("dm_control")
-    assert spec is not None and spec.origin is not None, "dm_control is not installed"
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("the Jaco arm needs dm_control: pip install dm-control")
     body = Body.load(Path(spec.origin).parent / "third_party/kinova/jaco_arm.xml")
     large = np.array([True, True, True, False, False, False])
     ranges = np.where(

@@ -1,7 +1,5 @@
 """Explorer of robots with a known body: limits, stops, payloads, and bad measurements."""
 
-import time
-
 import mujoco
 import numpy as np
 import pytest
@@ -108,7 +106,7 @@ def test_a_payload_is_noticed_said_once_and_weighed() -> None:
 
 
 def test_a_hung_point_mass_adds_its_gravity_and_inertia() -> None:
-    body, limits = small()
+    body = small()[0]
     known, last = KnownBody(body), body.moved[-1]
     place, mass = np.array([0.3, 0.05, -0.1]), 0.7
     known.hang(mass, mass * place)
