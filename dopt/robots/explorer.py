@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import chi2
 
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
@@ -68,7 +69,8 @@ class RobotExplorer:
 
     With ``inputs="references"``, each joint moves with constant speeds and bounded accelerations,
     tracked by computed torque with the friction learned so far. The next speed of a joint is the
-    one that narrows the widest intervals of its friction curve most, a second; ripple is a nuisance.
+    one that narrows the widest intervals of its friction curve most a second; ripple is a
+    nuisance.
     With ``inputs="torques"``, the torques of each period are the paper's D-optimal step.
 
     Parameters
@@ -147,18 +149,16 @@ class RobotExplorer:
         edge = EDGE * np.ptp(limits.position, axis=1)
         self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
         n = self.body.n
-        self._q, self._v, self._a = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._target, self._hold = np.zeros(n), np.zeros(n)
+        self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
         self.counts = {"bad": 0, "late": 0, "plans": 0, "windows": 0, "changed": 0}
         self.warnings: list[str] = []
         self.steps, self._wrong, self._asked = 0, 0, False
-        self._measured = np.zeros(n)
         self._rows: list[tuple[Array, ...]] = []
         self._recent: deque[Array] = deque(maxlen=RECENT)
         self._payload: list[tuple[Any, ...]] | None = None
         self._done = False
         self._due: float | None = None
-        self._alarm = _alarm(n)
+        self._alarm = float(chi2.isf(FALSE_ALARM, n))
 
     @property
     def done(self) -> bool:
@@ -375,12 +375,10 @@ class RobotExplorer:
         self._q = self._q - self._tracker.lag(self.learner.torques(self._v) - before)
         if self._changed():
             self.counts["changed"] += 1
-            text = (
+            self._say(
                 f"after {self.steps * self.dt:.2f} s the torques no longer fit the body and the "
                 f"friction learned: a payload is estimated, and friction learned again"
             )
-            self.warnings.append(text)
-            _log.warning(text)
             self._payload = []
             self._done = False
         elif self.stop and self.counts["windows"] % 5 == 0:
@@ -413,11 +411,13 @@ class RobotExplorer:
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)
-        text = f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3).tolist()} kg m"
-        self.warnings.append(text)
-        _log.warning(text)
+        self._say(f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3)} kg m")
         self._recent.clear()
         self._payload = None
+
+    def _say(self, text: str) -> None:
+        self.warnings.append(text)
+        _log.warning(text)
 
     def _reached(self) -> bool:
         half, sizes = self.learner.intervals()[1], self.learner.sizes()
@@ -434,27 +434,22 @@ class RobotExplorer:
 
         Heights of Stribeck friction are biased: it is fastest where joints turn round.
         """
-        values, half = self.learner.intervals()
-        torque, velocity = self.limits.torque, self.limits.velocity
-        joints = {}
-        for j, name in enumerate(self.body.joints):
-            joints[name] = {
-                "coulomb": (values[j, -2] * torque[j], half[j, -2] * torque[j]),
-                "viscous": tuple(x * torque[j] / velocity[j] for x in (values[j, -1], half[j, -1])),
-                "relative_width": float(half[j, :-2].max() / self.learner.sizes()[j]),
-                "noise": float(self.learner.noise[j] * torque[j]),
+        learner, unit, velocity = self.learner, self.limits.torque, self.limits.velocity
+        values, half = (part * unit[:, None] for part in learner.intervals())
+        joints = {
+            name: {
+                "coulomb": (values[j, -2], half[j, -2]),
+                "viscous": (values[j, -1] / velocity[j], half[j, -1] / velocity[j]),
+                "relative_width": half[j, :-2].max() / (learner.sizes()[j] * unit[j]),
+                "noise": learner.noise[j] * unit[j],
             }
-            if isinstance(self.learner.model, CoulombViscous):
-                heights = self.learner.mean[j, 2 : self.learner.p] * torque[j]
-                joints[name]["stribeck_biased"] = heights.tolist()
-        return {
-            "seconds": self.steps * self.dt,
-            "done": self._done,
-            "joints": joints,
-            "speeds": SPEEDS.tolist(),
-            "counts": dict(self.counts),
-            "warnings": list(self.warnings),
+            for j, name in enumerate(self.body.joints)
         }
+        if isinstance(learner.model, CoulombViscous):
+            for j, name in enumerate(self.body.joints):
+                joints[name]["stribeck_biased"] = learner.mean[j, 2 : learner.p] * unit[j]
+        done = {"seconds": self.steps * self.dt, "done": self._done, "joints": joints}
+        return done | {"counts": dict(self.counts), "warnings": list(self.warnings)}
 
 
 def _mean_features(start: Array, end: Array) -> Array:
@@ -463,12 +458,6 @@ def _mean_features(start: Array, end: Array) -> Array:
     cosines, sines = np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)
     result: Array = np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2)
     return result
-
-
-def _alarm(n: int) -> float:
-    from scipy.stats import chi2
-
-    return float(chi2.isf(FALSE_ALARM, n))
 
 
 __all__ = ["INPUTS", "RobotExplorer"]

@@ -1,15 +1,18 @@
 """Windows of samples, each an equation of motion, and intervals that hold at all times at once.
 
 The intervals come from a normal mixture with a delayed start: H. Robbins, "Statistical methods
-related to the law of the iterated logarithm", Ann. Math. Stat. 41, 5 (1970); S. R. Howard, A. Ramdas,
-J. McAuliffe and J. Sekhon, Ann. Stat. 49, 2 (2021); for one of several coefficients M. Lindon et al.,
-"Anytime-valid linear models" (arXiv:2210.08589). Inputs that depend on what was learned are not
-covered by the last one: ``studies/robots/online.py`` measures how often the intervals hold.
+related to the law of the iterated logarithm", Ann. Math. Stat. 41, 5 (1970); S. R. Howard et al.,
+"Time-uniform, nonparametric, nonasymptotic confidence sequences", Ann. Stat. 49, 2 (2021); for one
+of several coefficients M. Lindon et al., "Anytime-valid linear models" (arXiv:2210.08589). Inputs
+that depend on what was learned are not covered by the last one: ``studies/robots/online.py``
+measures how often the intervals hold.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
 
 from dopt.robots.limits import Limits
 from dopt.types import Array
@@ -76,9 +79,6 @@ def boundary(level: float) -> float:
     together kept with probability 1 - level by a sum S of variance I: Robbins (1970) from m on,
     and by reflection before.
     """
-    from scipy.optimize import brentq
-    from scipy.stats import norm
-
     return float(
         brentq(lambda a: 4.0 * norm.sf(a) + 2.0 * a * norm.pdf(a) - level, 1.0, 9.0, xtol=1e-9)
     )

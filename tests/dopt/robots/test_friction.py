@@ -101,7 +101,8 @@ def test_a_network_learns_the_curve_of_dry_and_viscous_friction() -> None:
     for joint in range(2):
         mean, low, high = learner.curve(joint, speeds * 2.0)
         np.testing.assert_allclose(mean / 50.0, expected[joint], atol=0.1 * expected.max())
-        assert (low < mean).all() and (mean < high).all()
+        assert (low < mean).all()
+        assert (mean < high).all()
 
 
 def test_slow_windows_teach_nothing() -> None:
