@@ -29,7 +29,7 @@ RIPPLE = np.arange(10.0, 41.0)
 """Periods a turn, or in 2π m, of torque that depends on the position."""
 
 RIPPLE_SIZE = 1.5
-"""Standard deviation of the ripple before any sample, in multiples of that of a window's noise."""
+"""Standard deviation of the ripple before any sample, in units of a window's noise."""
 
 NOISE = 0.003
 """Standard deviation of a window's torque before any sample, as a part of the limit."""
@@ -206,6 +206,12 @@ class FrictionLearner:
         return result
 
     def torques(self, velocities: Array) -> Array:
+        """Return friction as it was learned [N m], (n,), at velocities (n,)."""
+        x = (velocities / self.limits.velocity)[:, None]
+        result: Array = self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
+        return result
+
+    def feedforward(self, velocities: Array) -> Array:
         """Return friction to feed forward [N m], (n,), at velocities (n,).
 
         It is what was learned, less its standard error: too much of it drives a joint too fast.
@@ -229,7 +235,7 @@ class FrictionLearner:
     ) -> tuple[Array, Array, Array]:
         """Return e, H and its prior variance in units of noise: (n,), (n, d) and (n,).
 
-        Where a joint is too slow, e is NaN and H zero. The arguments are those of :meth:`learn`.
+        Where a joint is too slow, e is NaN and H zero. Arguments as of :meth:`learn`.
         """
         q, v, a, torque = means
         times, limit = self.window.times[1:-1], self.limits.velocity

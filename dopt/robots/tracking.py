@@ -112,16 +112,16 @@ class Tracker:
         """Return torques [N m], (n,), that follow a reference, within their limits."""
         wanted = a + BANDWIDTH**2 * (q - self.q) + 2.0 * BANDWIDTH * (v - self.v)
         demand = self.known.inverse(self.q, self.v, wanted) + self.friction(v)
-        result: Array = np.clip(demand, -self.limits.torque, self.limits.torque)
-        return result
+        clipped: Array = np.clip(demand, -self.limits.torque, self.limits.torque)
+        return clipped
 
     def lag(self, torque: Array) -> Array:
         """Return the error of position, (n,), that feeds back a torque [N m], (n,).
 
         A reference that is moved back by what a better feedforward makes up for does not hurry.
         """
-        result: Array = np.linalg.solve(self.known.mass_matrix(), torque) / BANDWIDTH**2
-        return result
+        fed: Array = np.linalg.solve(self.known.mass_matrix(), torque).astype(float)
+        return fed / BANDWIDTH**2
 
 
 def possible_acceleration(

@@ -62,7 +62,7 @@ class Trace:
     shares: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def settled(self, of: str = "errors") -> float:
-        """Return the time from which every joint stays within 5 %, infinite if there is none."""
+        """Return the time from which every joint stays within 5 %, infinite if it never does."""
         outside = np.flatnonzero(np.max(getattr(self, of), axis=1) > CLOSE)
         if len(outside) == 0:
             return self.times[0]
@@ -134,7 +134,7 @@ def track(robot: SimulatedRobot, motion: Motion, learner: FrictionLearner) -> Tr
     if abs(motion.dt - CONTROL) > 1e-9:
         motion = resampled(motion)
     known, trace = KnownBody(robot.body), Trace()
-    tracker = Tracker(known, robot.limits, learner.torques, CONTROL)
+    tracker = Tracker(known, robot.limits, learner.feedforward, CONTROL)
     robot.place(motion.positions[0])
     tracker.place(motion.positions[0])
     rows: list[tuple[Array, Array]] = []
