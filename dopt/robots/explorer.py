@@ -340,7 +340,7 @@ class RobotExplorer:
         parameters = learner.mean[:, :p]
         J = learner.model.jacobian(parameters, x)[:, 0]
         bent = learner.model.slopes(parameters, x)[1][:, 0] / limits.velocity[:, None]
-        weighed = np.squeeze(learner.covariance[:, :p, :p] @ bent[..., None], 2)
+        weighed = (learner.covariance[:, :p, :p] @ bent[..., None])[..., 0]
         D = self.dt * inverse * limits.torque
         Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)
         v = -D.T @ (J * weighed).sum(axis=1)
@@ -349,12 +349,14 @@ class RobotExplorer:
         after = tracker.v + self.dt * a
         rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
         outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
-        fast = np.abs(after) > GUARDED * limits.velocity
-        brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
-        self._a = np.where(outward | fast, brake, a)
+        guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
+        if guarded.any():
+            brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
+            a = np.where(guarded, brake, a)
+        self._a = a
         demand = mass @ self._a + bias + friction
         self._q, self._v = tracker.q.copy(), tracker.v.copy()
-        torque: Array = np.clip(demand, -limits.torque, limits.torque)
+        torque: Array = np.minimum(np.maximum(demand, -limits.torque), limits.torque)
         return torque
 
     # What a window teaches.
@@ -470,7 +472,8 @@ def _on_sphere(Q: Array, v: Array, radius: float) -> Array:
     low, high = abs(w[-1]) / radius, float(np.linalg.norm(w)) / radius
     tau = low
     if high > low * (1.0 + 1e-12):
-        tau = brentq(lambda t: float(((w / (gaps + t)) ** 2).sum()) - radius**2, low, high)
+        pairs = list(zip(w.tolist(), gaps.tolist(), strict=True))
+        tau = brentq(lambda t: sum((x / (d + t)) ** 2 for x, d in pairs) - radius**2, low, high)
     u = axes @ (-w / (gaps + tau))
     result: Array = u * (radius / np.linalg.norm(u))
     return result

@@ -112,7 +112,7 @@ class Tracker:
         """Return torques [N m], (n,), that follow a reference, within their limits."""
         wanted = a + BANDWIDTH**2 * (q - self.q) + 2.0 * BANDWIDTH * (v - self.v)
         demand = self.known.inverse(self.q, self.v, wanted) + self.friction(v)
-        clipped: Array = np.clip(demand, -self.limits.torque, self.limits.torque)
+        clipped: Array = np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
         return clipped
 
     def lag(self, torque: Array) -> Array:
