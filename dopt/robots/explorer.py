@@ -46,7 +46,7 @@ RECENT = 10
 """Windows whose innovations are compared with their intervals, and, from the 30th, are enough."""
 
 LIFTED = 2.0
-"""Seconds from which a payload is estimated, at least 10 windows."""
+"""Seconds from which a payload is estimated, at least 20 windows."""
 
 LOST = 50
 """Measurements in turn that make no sense, after which the next is believed."""
@@ -369,7 +369,7 @@ class RobotExplorer:
         self.counts["windows"] += 1
         if self._payload is not None:
             self._payload.append((means, rates))
-            if len(self._payload) >= max(RECENT, LIFTED / self.learner.window.seconds):
+            if len(self._payload) >= max(2 * RECENT, LIFTED / self.learner.window.seconds):
                 self._lift(self._payload)
             return
         before = self.learner.feedforward(self._v)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import itertools
 import sys
 import time
 from collections.abc import Iterator
@@ -258,9 +259,9 @@ def _settled(name: str, label: str, seed: int, trace: Trace) -> Iterator[Row]:
 
 
 def payload(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
-    """Hang a mass on the last body after 6 s, 5 % of the arm's, and see what is said of it."""
-    mass = 0.05 * float(body.model.body_mass.sum())
-    for seed in seeds:
+    """Hang 5 or 15 % of the arm's mass on the last body after 6 s, and see what is said of it."""
+    whole = float(body.model.body_mass.sum())
+    for mass, seed in itertools.product((0.05 * whole, 0.15 * whole), seeds):
         robot = SimulatedRobot(body, limits, seed, payload=(6.0, mass))
         explorer = RobotExplorer(body, limits, seed=seed)
         before = float(explorer.known.model.body_mass[body.moved[-1]])
