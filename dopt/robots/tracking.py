@@ -90,8 +90,8 @@ class Tracker:
         self, known: KnownBody, limits: Limits, friction: Callable[[Array], Array], dt: float
     ) -> None:
         self.known, self.limits, self.friction, self.dt = known, limits, friction, dt
-        self.q = np.array(known.body.home)
-        self.v = np.zeros(len(self.q))
+        self.q: Array = np.array(known.body.home)
+        self.v: Array = np.zeros(len(self.q))
 
     def place(self, q: Array) -> None:
         """Begin at rest at a position, (n,)."""
@@ -112,8 +112,16 @@ class Tracker:
         """Return torques [N m], (n,), that follow a reference, within their limits."""
         wanted = a + BANDWIDTH**2 * (q - self.q) + 2.0 * BANDWIDTH * (v - self.v)
         demand = self.known.inverse(self.q, self.v, wanted) + self.friction(v)
-        result: Array = np.clip(demand, -self.limits.torque, self.limits.torque)
-        return result
+        clipped: Array = np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
+        return clipped
+
+    def lag(self, torque: Array) -> Array:
+        """Return the error of position, (n,), that feeds back a torque [N m], (n,).
+
+        A reference that is moved back by what a better feedforward makes up for does not hurry.
+        """
+        fed: Array = np.linalg.solve(self.known.mass_matrix(), torque).astype(float)
+        return fed / BANDWIDTH**2
 
 
 def possible_acceleration(
@@ -125,7 +133,8 @@ def possible_acceleration(
     """
     random, n = np.random.default_rng(0), len(limits.torque)
     least, largest = np.array(limits.acceleration, dtype=float), np.zeros(n)
-    for q in random.uniform(*limits.position.T, (200, n)):
+    low, high = limits.position.T
+    for q in low + (high - low) * random.random((200, n)):
         held = np.abs(known.inverse(q, np.zeros(n), np.zeros(n)))
         own = np.diag(known.mass_matrix())
         least = np.minimum(least, np.maximum(share * limits.torque - held, 0.0) / own)
