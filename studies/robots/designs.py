@@ -1,8 +1,9 @@
-"""Designs for many unknowns: expected errors by those of multisines, and errors of fits after them.
+"""Designs for many unknowns: expected errors by multisines, and errors of fits after them.
 
-``python -m studies.robots.designs --urdf MODEL --limits FILE --seeds 20`` appends a row for each arm
-and seed to ``docs/robots_designs.csv``. The seed draws the multisines, the search, and a robot whose
-parameters differ from the file's by 10 % of each one's size; torques are measured with white noise.
+``python -m studies.robots.designs --urdf MODEL --limits FILE --seeds 20`` appends a row for each
+arm and seed to ``docs/robots_designs.csv``. The seed draws the multisines, the search, and a robot
+whose parameters differ from the file's by 10 % of each one's size; torques are measured with white
+noise.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import copy
 import csv
+import sys
 import time
 from pathlib import Path
 
@@ -75,7 +77,8 @@ def measured(robot: SimulatedRobot, nominal: Body, gears: Array, motion: Motion)
     speed = SLOW * robot.limits.velocity
 
     def expected(v: Array) -> Array:
-        return damping * v + dry * np.tanh(v / speed)
+        torques: Array = damping * v + dry * np.tanh(v / speed)
+        return torques
 
     tracker = Tracker(KnownBody(nominal), robot.limits, expected, CONTROL)
     robot.place(motion.positions[0])
@@ -110,8 +113,8 @@ def held(motion: Motion) -> Motion:
     """Return the means of a motion while each torque is held, without its ends."""
     inner = slice(WINDOW, -WINDOW)
     q, v = motion.positions, motion.velocities
-    middle = (0.5 * (part[1:] + part[:-1])[inner] for part in (q, v))
-    return Motion(CONTROL, *middle, (np.diff(v, axis=0) / CONTROL)[inner])
+    positions, velocities = (0.5 * (part[1:] + part[:-1])[inner] for part in (q, v))
+    return Motion(CONTROL, positions, velocities, (np.diff(v, axis=0) / CONTROL)[inner])
 
 
 def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
@@ -220,7 +223,7 @@ def main() -> None:
                 writer.writerow(
                     {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in one.items()}
                 )
-            print(one, flush=True)
+            sys.stdout.write(f"{arm} {seed}: {one['ratio']:.3f} of the multisines\n")
 
 
 if __name__ == "__main__":
