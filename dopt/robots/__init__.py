@@ -2,7 +2,8 @@
 
 from dopt.robots.body import Body, Motion
 from dopt.robots.design import Design, Problem
+from dopt.robots.explorer import RobotExplorer
 from dopt.robots.limits import Limits
 from dopt.robots.sysid import sequences
 
-__all__ = ["Body", "Design", "Limits", "Motion", "Problem", "sequences"]
+__all__ = ["Body", "Design", "Limits", "Motion", "Problem", "RobotExplorer", "sequences"]

@@ -30,7 +30,7 @@ SLOWEST = 0.02
 SEGMENT = 0.5
 """Seconds of a ladder's segment at the least."""
 
-HARMONICS = 5
+HARMONICS = 10
 """Harmonics of a Fourier series."""
 
 
