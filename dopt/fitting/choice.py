@@ -1,0 +1,416 @@
+"""Choice of recorded segments, or of input signals, by what they tell of a plant's parameters.
+
+A candidate has the sensitivities J of its simulation, (rows, q): derivatives of what is measured by
+the parameters, of which each is in standard deviations of its prior, in units of the residuals that
+are expected. One after the other is taken the candidate that raises most
+
+    log det(I + Σ JᵀJ)
+
+over what was taken before and it: the entropy of the parameters falls by half of that. The initial
+state of a recorded window is unknown, and what it could explain is taken out of J; a signal begins
+at a state that is given. Where the model is not fitted again in between, the sum is at least
+1 - 1/e of the largest one of as many candidates, because log det is submodular.
+
+References: V. Fedorov, "Theory of optimal experiments" (1972); G. Nemhauser, L. Wolsey and
+M. Fisher, "An analysis of approximations for maximizing submodular set functions" (1978).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.arguments import finite, instance, reals, whole, within
+from dopt.errors import SpecificationError, unknown_name
+from dopt.fitting.fit import (
+    FEWEST_ROWS,
+    LENGTHS,
+    latest_effect,
+    layout_of,
+    logs_of,
+    measuring,
+    rescaled,
+    rows_of_logs,
+    time_scale,
+)
+from dopt.fitting.fitted import Fitted
+from dopt.fitting.model import Model, data_of, measured_names
+from dopt.fitting.problem import Simulator, Windows, first_states, solve, windows_of
+from dopt.fitting.simulation import Data
+from dopt.log import Log, Piece
+from dopt.systems.plant import Plant, Unknown, first_guess
+from dopt.types import Array, Integers
+
+ORDERS = ("information", "random")
+
+
+class State(NamedTuple):
+    """What is known of a plant: the parameters at which information is computed."""
+
+    model: Model
+    p: Array  # (q,)
+    s: float  # residuals count as so many times larger
+    covariance: Array  # (q, q) inverse of I + Σ JᵀJ
+
+    @property
+    def constants(self) -> dict[str, tuple[float, float]]:
+        """Value and expected standard error of each unknown constant, of delay and lag [s]."""
+        values, slopes = self.model.named_values(self.p)
+        errors = np.abs(slopes) * np.sqrt(np.diag(self.covariance)[self.model.named])
+        return {
+            name: (value, float(error))
+            for (name, value), error in zip(values.items(), errors, strict=True)
+        }
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Candidates in the order in which they are worth taking (:func:`dopt.choose`).
+
+    Attributes
+    ----------
+    indices : tuple of int
+        Places in the pool, or among its segments; without ``taken``.
+    gains : (k,) array
+        What each raised log det by, at what was known when it was taken.
+    shares : (k,) array
+        Information of all taken so far by that of the whole pool: differences of log det.
+    logs : tuple of Log
+        What was chosen, for :func:`dopt.fit`; empty for signals.
+    places : tuple of str
+        Where each of them is found.
+    states : tuple of State
+        What was known before the first choice, and, with a refit, after each.
+    pool : int
+        Number of candidates.
+    silent : tuple of int
+        Candidates that tell nothing: too short, or not simulated within the plant's limits.
+    """
+
+    indices: tuple[int, ...]
+    gains: Array
+    shares: Array
+    logs: tuple[Log, ...]
+    places: tuple[str, ...]
+    states: tuple[State, ...]
+    pool: int
+    silent: tuple[int, ...]
+
+    def report(self) -> str:
+        """Return what was chosen and what is known by then, line by line."""
+        last = self.states[-1]
+        lines = [f"{len(self.indices)} of {self.pool} candidates, {last.model.q} parameters"]
+        lines += [
+            f"  {n:>3}. {place}: log det +{gain:.3g}, {100 * share:.3g} % of the pool's information"
+            for n, (place, gain, share) in enumerate(
+                zip(self.places, self.gains, self.shares, strict=True), 1
+            )
+        ]
+        if self.silent:
+            lines.append(
+                f"  {len(self.silent)} tell nothing: too short, or beyond the plant's limits"
+            )
+        when = "after the last" if len(self.states) > 1 else "before the first"
+        lines.append(f"Constants {when} (expected standard errors)")
+        lines += [f"  {n:<12} {value:.5g} ± {e:.2g}" for n, (value, e) in last.constants.items()]
+        return "\n".join(lines)
+
+
+def choose(
+    plant: Plant | Fitted,
+    pool: Any,
+    k: int,
+    *,
+    seconds: float | None = None,
+    start: npt.ArrayLike | None = None,
+    taken: Sequence[int] = (),
+    refit: bool = True,
+    by: str = "information",
+    width: int = 16,
+    weight: float = 10.0,
+    window: float | None = None,
+    hold: str = "zero",
+    seed: int = 0,
+) -> Choice:
+    """Choose k recorded segments, or input signals, that tell most of a plant's parameters.
+
+    Parameters
+    ----------
+    plant : Plant or Fitted
+        With :func:`dopt.unknown` constants. Of a fit, what it was fitted to counts as known, and
+        ``width``, ``weight`` and ``hold`` are its own.
+    pool : sequence of Log, table or array
+        Candidates: logs (or tables, as :func:`dopt.fit` takes them), or, with ``start``, signals,
+        each (N, m), whose rows are held for ``plant.dt``.
+    k : int
+        How many to choose.
+    seconds : float, optional
+        Cut the logs into segments of so many seconds, which are the candidates.
+    start : (d,) array, optional
+        State at which every signal begins.
+    taken : sequence of int
+        Candidates that are taken already.
+    refit : bool
+        Fit the model to what was taken after each choice; never to signals, which have not run.
+    by : {"information", "random"}
+        ``random`` takes them in an order drawn by the seed, for comparison.
+    width : int
+        Units of the network beside the known part; 0 for none.
+    weight : float
+        How many times larger than they are the residuals of a network count as, because those in a
+        window are one smooth curve.
+    window : float, optional
+        Longest window [s], whose initial state is unknown; .8 of the time scale by default.
+    hold : {"zero", "linear"}
+        As of :func:`dopt.fit`.
+    seed : int
+        Of the initial weights of the network, and of a random order.
+
+    Raises
+    ------
+    SpecificationError
+        If the pool is no pool of the plant, or holds fewer than k candidates.
+    """
+    instance("plant", plant, Plant | Fitted, "a dopt.Plant or a result of dopt.fit")
+    within("weight", weight, math.inf)
+    if by not in ORDERS:
+        raise unknown_name("order in 'by'", by, ORDERS)
+    declared = plant.plant if isinstance(plant, Fitted) else plant
+    if start is not None:
+        start = finite("start", start, len(declared.states))
+        logs, places = _signals(declared, pool, seconds)
+    else:
+        logs, places = _recorded(declared, pool, seconds)
+    n = len(logs)
+    chosen = [whole("an index in taken", i, 0, n - 1) for i in taken]
+    if len({*chosen}) < len(chosen) or whole("k", k, 0) + len(chosen) > n:
+        raise SpecificationError(
+            f"k is {k} and taken is {chosen}, but different candidates, at most {n} in all, are "
+            f"expected: correct them."
+        )
+    search = _Search(
+        plant, logs, start, seconds, window, whole("width", width, 0), weight, hold, seed
+    )
+    states, gains, shares = list[State](), list[float](), list[float]()
+    order, first = np.random.default_rng(seed).permutation(n), len(chosen)
+    for step in range(k + 1):
+        if refit and start is None and chosen:
+            search.fit(chosen)
+        if step == 0 or (refit and start is None):
+            base, each = search.information()
+            before, all_of_it = _log_det(base), _log_det(base + each.sum(axis=0))
+            states.append(search.state(base + each[chosen].sum(axis=0)))
+        M = base + each[chosen].sum(axis=0)
+        if step:
+            shares.append((_log_det(M) - before) / max(all_of_it - before, 1e-300))
+        if step < k:
+            more = _log_det(M + each) - _log_det(M)
+            more[chosen] = -np.inf
+            drawn = (int(j) for j in order if j not in chosen)
+            chosen.append(int(np.argmax(more)) if by == "information" else next(drawn))
+            gains.append(float(more[chosen[-1]]))
+    new = tuple(chosen[first:])
+    return Choice(
+        indices=new,
+        gains=np.array(gains),
+        shares=np.array(shares),
+        logs=tuple(logs[i] for i in new if start is None),
+        places=tuple(places[i] for i in new),
+        states=tuple(states),
+        pool=n,
+        silent=tuple(map(int, np.flatnonzero(~each.any(axis=(1, 2))))),
+    )
+
+
+def _log_det(M: Array) -> Any:
+    return np.linalg.slogdet(M)[1]
+
+
+def _signals(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log], list[str]]:
+    """Return signals as logs in which 0 was measured, and their names."""
+    if not plant.measured or seconds is not None:
+        raise SpecificationError(
+            f"signals were given with seconds {seconds!r} and the measured states "
+            f"{[*plant.measured]}, but whole signals and the noise of what will be measured are "
+            f"expected: leave seconds out, and declare 'measured' in the plant."
+        )
+    logs, names, m = [], measured_names(plant), len(plant.inputs)
+    for i, one in enumerate(pool):
+        u = reals(f"inputs of signal {i}", one)
+        u = u[:, None] if u.ndim == m == 1 else u
+        if u.ndim != 2 or u.shape[1] != m or len(u) < 2 or not np.isfinite(u).all():
+            raise SpecificationError(
+                f"signal {i} has the shape {u.shape}, but finite inputs of the shape (N, {m}), N "
+                f"at least 2, are expected: correct it."
+            )
+        piece = Piece(np.arange(len(u)) * plant.dt, np.zeros((len(u), len(names))), u)
+        logs.append(Log.of_pieces(names, [*plant.inputs], [piece]))
+    return logs, [f"signal {i}" for i in range(len(logs))]
+
+
+def _recorded(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log], list[str]]:
+    """Return logs, or segments of them with the inputs around them that act, and where they are."""
+    if any(isinstance(one, np.ndarray) for one in pool):
+        raise SpecificationError(
+            "the pool holds arrays, but logs are expected, or signals with the state at which they "
+            "begin: give start."
+        )
+    logs = logs_of(plant, pool)
+    if seconds is None:
+        return logs, [f"log {i}" for i in range(len(logs))]
+    out, places, seconds = [], [], within("seconds", seconds, math.inf)
+    for number, log in enumerate(logs):
+        step = log.step
+        lead, tail = (margin + step for margin in _margins(plant, step))
+        for time, measured, inputs in log.pieces if seconds > 2 * step else ():
+            begin = time[0] + lead
+            while begin + seconds + tail <= time[-1]:
+                ends = begin - lead - 0.5 * step, begin + seconds + tail + 0.5 * step
+                rows = slice(*np.searchsorted(time, ends))
+                piece = Piece(time[rows], measured[rows], inputs[rows])
+                out.append(Log.of_pieces(log.states, log.inputs, [piece]))
+                places.append(f"log {number}, {begin:.6g} to {begin + seconds:.6g} s")
+                begin += seconds
+    if not out:
+        raise SpecificationError(
+            f"seconds is {seconds:g}, but segments of more than two samples, and shorter than the "
+            f"pieces of the logs, are expected: change it."
+        )
+    return out, places
+
+
+def _margins(plant: Plant, step: float) -> tuple[float, float]:
+    """Return how long before and after a window its inputs have to be known [s]."""
+    return latest_effect(plant, first_guess(plant.delay), step), 2.0 * step
+
+
+class _Search:
+    """The model at what is known, and the windows of all candidates; owner -1: of a fit before."""
+
+    def __init__(
+        self,
+        given: Plant | Fitted,
+        logs: Sequence[Log],
+        start: Array | None,
+        seconds: float | None,
+        longest: float | None,
+        width: int,
+        weight: float,
+        hold: str,
+        seed: int,
+    ) -> None:
+        self.n, self.start, self.weight = len(logs), start, weight
+        fitted = given if isinstance(given, Fitted) else None
+        self.plant = given.plant if isinstance(given, Fitted) else measuring(given, logs)
+        hold = fitted.hold if fitted else hold
+        deviations = fitted.data.deviations if fitted else None
+        self.data = data_of(self.plant, logs, "zero" if start is not None else hold, deviations)
+        rows = self._rows(logs, seconds, longest)
+        self.owners = np.repeat(np.arange(self.n), [len(one) for one in rows])
+        both = np.concatenate(rows)
+        if fitted:
+            self.physics, self.model = fitted.physics.model, fitted.chosen.model
+            self.constants, self.p = fitted.physics.solution.p, fitted.chosen.solution.p
+            self.s = self.weight = fitted.chosen.s
+            own = fitted.chosen.solution.windows.rows
+            self.owners = np.concatenate([np.full(len(own), -1), self.owners])
+            both = np.concatenate([own, both + len(fitted.data.time)])
+            self.data = _joined(fitted.data, self.data)
+        else:
+            delay, lag = self.plant.delay, self.plant.lag
+            self.physics = Model(
+                self.plant,
+                delay=first_guess(delay),
+                free_delay=isinstance(delay, Unknown),
+                free_lag=isinstance(lag, Unknown),
+            )
+            self.model, self.p = self.physics, self.physics.prior
+            self.constants, self.s = self.p, 1.0
+        self.windows = Windows(both, first_states(self.data, self.model, both))
+        if start is not None:
+            self.windows.starts[self.owners >= 0] = start
+        self._settle()
+        if width and not fitted:
+            layout = layout_of(self.physics, self.data, self.p, self.windows)
+            self.model, self.s = self.physics.with_network(width, layout, seed), weight
+            self.p = self.model.extended(self.p, self.physics)
+        if not self.model.q:
+            raise SpecificationError(
+                "the plant has no unknown constant, delay or lag and there is no network, but "
+                "something to learn is expected: declare one with dopt.unknown(), or give a width."
+            )
+
+    def _rows(
+        self, logs: Sequence[Log], seconds: float | None, longest: float | None
+    ) -> list[Integers]:
+        """Return first and last rows of the windows of each candidate, (w, 2)."""
+        ends = [(int(one[0]), int(one[-1])) for one in rows_of_logs(self.data, logs)]
+        if self.start is not None:
+            return [np.array([both]) for both in ends]
+        step = float(np.median([log.step for log in logs]))
+        default = max(LENGTHS[2] * time_scale(self.data), FEWEST_ROWS * step)
+        length = default if longest is None else within("window", longest, math.inf)
+        if seconds is not None:
+            length = seconds / math.ceil(seconds / length - 1e-9) - 0.5 * step
+        skip, ahead = _margins(self.plant, step)
+        return [windows_of(self.data, *both, length, skip=skip, ahead=ahead) for both in ends]
+
+    def _settle(self) -> None:
+        """Move the initial states that are free to where they fit best."""
+        free = self.owners < (0 if self.start is not None else self.n)
+        if free.any():
+            simulator = Simulator(self.model, self.data)
+            found = simulator.settled(self.p, self.windows.where(free))
+            self.windows.starts[free] = found.starts
+
+    def fit(self, chosen: Sequence[int]) -> None:
+        """Fit the constants, and then a network, to some candidates and to what was known."""
+        mine = np.isin(self.owners, [-1, *chosen])
+        if not mine.any():
+            return
+        windows, physics = self.windows.where(mine), self.physics
+        found = solve(Simulator(physics, self.data), windows, self.constants, 1.0)
+        self.data = rescaled(self.plant, self.data, physics, found)
+        found = solve(Simulator(physics, self.data), found.windows, found.p, 1.0)
+        self.constants = self.p = found.p
+        if self.model is not physics:
+            size = np.sqrt(np.median(found.squares / found.windows.counts(self.data)))
+            self.s, p = (
+                self.weight * max(float(size), 1e-300),
+                self.model.extended(found.p, physics),
+            )
+            simulator = Simulator(self.model, self.data)
+            self.p = solve(simulator, found.windows, p, self.s, scale=found.scale).p
+        self._settle()
+
+    def information(self) -> tuple[Array, Array]:
+        """Return I and the information of what was known, (q, q), and that of each, (n, q, q)."""
+        out = np.zeros((self.n + 1, self.model.q, self.model.q))
+        simulator = Simulator(self.model, self.data)
+        for owner in np.unique(self.owners):
+            windows = self.windows.where(self.owners == owner)
+            if owner < 0 or self.start is None:
+                weights = np.full(len(windows.rows), self.s**-2)
+                out[owner + 1] = simulator.linear(self.p, windows, weights).normal
+            else:
+                _, S = simulator.slopes(self.p, *windows.rows[0], windows.starts[0])
+                R = S[:, self.model.structure.measured, : self.model.q] / self.s
+                R = (R / self.data.deviations[:, None]).reshape(-1, self.model.q)
+                out[owner + 1] = R.T @ R if np.isfinite(R).all() else 0.0
+        return np.eye(self.model.q) + out[0], out[1:]
+
+    def state(self, M: Array) -> State:
+        """Return what is known, with information M."""
+        return State(self.model, self.p, self.s, np.linalg.inv(M))
+
+
+def _joined(a: Data, b: Data) -> Data:
+    """Return the rows of both, with the deviations of the first."""
+    n = len(a.time)
+    ends = (np.concatenate([x, y + n]) for x, y in zip(a[3:5], b[3:5], strict=True))
+    return Data(*map(np.concatenate, zip(a[:3], b[:3], strict=True)), *ends, a.deviations)
