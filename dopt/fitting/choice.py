@@ -44,7 +44,7 @@ from dopt.fitting.problem import Simulator, Windows, first_states, solve, window
 from dopt.fitting.simulation import Data
 from dopt.log import Log, Piece
 from dopt.systems.plant import Plant, Unknown, first_guess
-from dopt.types import Array, Integers
+from dopt.types import Array, Booleans, Integers
 
 ORDERS = ("information", "random")
 
@@ -362,11 +362,15 @@ class _Search:
 
     def _settle(self) -> None:
         """Move the initial states that are free to where they fit best."""
-        free = self.owners < (0 if self.start is not None else self.n)
+        simulator, free = Simulator(self.model, self.data), self._free()
         if free.any():
-            simulator = Simulator(self.model, self.data)
             found = simulator.settled(self.p, self.windows.where(free))
             self.windows.starts[free] = found.starts
+
+    def _free(self) -> Booleans:
+        """Return which windows begin at a state that is unknown."""
+        free: Booleans = self.owners < (0 if self.start is not None else self.n)
+        return free
 
     def fit(self, chosen: Sequence[int]) -> None:
         """Fit the constants, and then a network, to some candidates and to what was known."""
@@ -390,19 +394,17 @@ class _Search:
 
     def information(self) -> tuple[Array, Array]:
         """Return I and the information of what was known, (q, q), and that of each, (n, q, q)."""
-        out = np.zeros((self.n + 1, self.model.q, self.model.q))
-        simulator = Simulator(self.model, self.data)
-        for owner in np.unique(self.owners):
-            windows = self.windows.where(self.owners == owner)
-            if owner < 0 or self.start is None:
-                weights = np.full(len(windows.rows), self.s**-2)
-                out[owner + 1] = simulator.linear(self.p, windows, weights).normal
-            else:
-                _, S = simulator.slopes(self.p, *windows.rows[0], windows.starts[0])
-                R = S[:, self.model.structure.measured, : self.model.q] / self.s
-                R = (R / self.data.deviations[:, None]).reshape(-1, self.model.q)
-                out[owner + 1] = R.T @ R if np.isfinite(R).all() else 0.0
-        return np.eye(self.model.q) + out[0], out[1:]
+        q, simulator = self.model.q, Simulator(self.model, self.data)
+        out, free = np.zeros((self.n + 1, q, q)), self._free()
+        windows, owners = self.windows.where(free), self.owners[free] + 1
+        weights = np.full(len(owners), self.s**-2)
+        found = simulator.linear(self.p, windows, weights, owners=owners).parts
+        out[: len(found)] = found
+        for i in np.flatnonzero(~free):
+            _, S = simulator.slopes(self.p, *self.windows.rows[i], self.windows.starts[i])
+            R = S[:, self.model.structure.measured, :q] / (self.s * self.data.deviations[:, None])
+            out[self.owners[i] + 1] = np.einsum("tnq,tnr->qr", R, R) if np.isfinite(R).all() else 0
+        return np.eye(q) + out[0], out[1:]
 
     def state(self, M: Array) -> State:
         """Return what is known, with information M."""
