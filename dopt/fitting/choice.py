@@ -132,7 +132,7 @@ def choose(
     refit: bool = True,
     by: str = "information",
     width: int = 16,
-    weight: float = 10.0,
+    weight: float = 3.0,
     window: float | None = None,
     hold: str = "zero",
     seed: int = 0,
@@ -254,16 +254,21 @@ def _signals(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log],
 
 
 def _recorded(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log], list[str]]:
-    """Return logs, or segments of them with the inputs around them that act, and where they are."""
+    """Return logs, or segments of them, and where they are."""
     if any(isinstance(one, np.ndarray) for one in pool):
         raise SpecificationError(
             "the pool holds arrays, but logs are expected, or signals with the state at which they "
             "begin: give start."
         )
     logs = logs_of(plant, pool)
-    if seconds is None:
-        return logs, [f"log {i}" for i in range(len(logs))]
-    out, places, seconds = [], [], within("seconds", seconds, math.inf)
+    if seconds is not None:
+        return segments_of(plant, logs, within("seconds", seconds, math.inf))
+    return logs, [f"log {i}" for i in range(len(logs))]
+
+
+def segments_of(plant: Plant, logs: Sequence[Log], seconds: float) -> tuple[list[Log], list[str]]:
+    """Return segments of logs, each with the inputs around it that act, and where they are."""
+    out, places = [], []
     for number, log in enumerate(logs):
         step = log.step
         lead, tail = (margin + step for margin in _margins(plant, step))

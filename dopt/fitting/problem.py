@@ -12,7 +12,6 @@ few of those in a window are independent. A step is taken by the method of Leven
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -321,12 +320,21 @@ def call(function: Any, *arguments: Any) -> Any:
     """Call a compiled function, with the known part as a pointer: it is compiled once for all."""
     if PLAIN:
         return function(*arguments)
-    return _code(function, tuple(map(_kind, arguments)))(*arguments)
+    key = function, *map(_key, arguments)
+    if key not in _codes:
+        _codes[key] = function.compile(tuple(map(_kind, arguments)))
+    return _codes[key](*arguments)
 
 
-@functools.cache
-def _code(function: Any, kinds: tuple[Any, ...]) -> Any:
-    return function.compile(kinds)
+_codes: dict[Any, Any] = {}
+
+
+def _key(value: Any) -> Any:
+    """Return what decides the type of an argument, which takes Numba far longer to tell."""
+    if isinstance(value, np.ndarray):
+        f = value.flags
+        return value.dtype.char, value.ndim, f.c_contiguous, f.f_contiguous, f.writeable
+    return (type(value), *map(_key, value)) if isinstance(value, tuple) else type(value)
 
 
 def _kind(value: Any) -> Any:
