@@ -44,9 +44,12 @@ from dopt.fitting.problem import Simulator, Windows, first_states, solve, window
 from dopt.fitting.simulation import Data
 from dopt.log import Log, Piece
 from dopt.systems.plant import Plant, Unknown, first_guess
-from dopt.types import Array, Booleans, Integers
+from dopt.types import Array, Integers
 
 ORDERS = ("information", "random")
+
+LEAST = 0.1
+"""Least residuals of the constants that a network is weighed by, in deviations."""
 
 
 class State(NamedTuple):
@@ -62,10 +65,7 @@ class State(NamedTuple):
         """Value and expected standard error of each unknown constant, of delay and lag [s]."""
         values, slopes = self.model.named_values(self.p)
         errors = np.abs(slopes) * np.sqrt(np.diag(self.covariance)[self.model.named])
-        return {
-            name: (value, float(error))
-            for (name, value), error in zip(values.items(), errors, strict=True)
-        }
+        return dict(zip(values, zip(values.values(), errors.tolist(), strict=True), strict=True))
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,9 @@ class Choice:
     ----------
     indices : tuple of int
         Places in the pool, or among its segments; without ``taken``.
-    gains : (k,) array
-        What each raised log det by, at what was known when it was taken.
-    shares : (k,) array
-        Information of all taken so far by that of the whole pool: differences of log det.
+    gains, shares : (k,) arrays
+        What each raised log det by, at what was known when it was taken; information of all taken
+        so far by that of the whole pool, as differences of log det.
     logs : tuple of Log
         What was chosen, for :func:`dopt.fit`; empty for signals.
     places : tuple of str
@@ -88,8 +87,6 @@ class Choice:
         What was known before the first choice, and, with a refit, after each.
     pool : int
         Number of candidates.
-    silent : tuple of int
-        Candidates that tell nothing: too short, or not simulated within the plant's limits.
     """
 
     indices: tuple[int, ...]
@@ -99,26 +96,22 @@ class Choice:
     places: tuple[str, ...]
     states: tuple[State, ...]
     pool: int
-    silent: tuple[int, ...]
 
     def report(self) -> str:
         """Return what was chosen and what is known by then, line by line."""
-        last = self.states[-1]
-        lines = [f"{len(self.indices)} of {self.pool} candidates, {last.model.q} parameters"]
-        lines += [
-            f"  {n:>3}. {place}: log det +{gain:.3g}, {100 * share:.3g} % of the pool's information"
-            for n, (place, gain, share) in enumerate(
-                zip(self.places, self.gains, self.shares, strict=True), 1
-            )
-        ]
-        if self.silent:
-            lines.append(
-                f"  {len(self.silent)} tell nothing: too short, or beyond the plant's limits"
-            )
-        when = "after the last" if len(self.states) > 1 else "before the first"
-        lines.append(f"Constants {when} (expected standard errors)")
-        lines += [f"  {n:<12} {value:.5g} ± {e:.2g}" for n, (value, e) in last.constants.items()]
-        return "\n".join(lines)
+        last, when = self.states[-1], "after the last" if len(self.states) > 1 else "before"
+        rows = enumerate(zip(self.places, self.gains, self.shares, strict=True), 1)
+        return "\n".join(
+            [
+                f"{len(self.indices)} of {self.pool} candidates, {last.model.q} parameters",
+                *(
+                    f"  {n:>3}. {place}: log det +{gain:.3g}, {share:.1%} of the pool's information"
+                    for n, (place, gain, share) in rows
+                ),
+                f"Constants {when} (expected standard errors)",
+                *(f"  {name:<12} {v:.5g} ± {e:.2g}" for name, (v, e) in last.constants.items()),
+            ]
+        )
 
 
 def choose(
@@ -177,7 +170,6 @@ def choose(
         If the pool is no pool of the plant, or holds fewer than k candidates.
     """
     instance("plant", plant, Plant | Fitted, "a dopt.Plant or a result of dopt.fit")
-    within("weight", weight, math.inf)
     if by not in ORDERS:
         raise unknown_name("order in 'by'", by, ORDERS)
     declared = plant.plant if isinstance(plant, Fitted) else plant
@@ -193,21 +185,23 @@ def choose(
             f"k is {k} and taken is {chosen}, but different candidates, at most {n} in all, are "
             f"expected: correct them."
         )
-    search = _Search(
-        plant, logs, start, seconds, window, whole("width", width, 0), weight, hold, seed
-    )
+    size = whole("width", width, 0), within("weight", weight, math.inf)
+    search = _Search(plant, logs, start, hold, seconds, window)
+    search.add_network(*size, seed)
     states, gains, shares = list[State](), list[float](), list[float]()
     order, first = np.random.default_rng(seed).permutation(n), len(chosen)
+    refit = refit and start is None
     for step in range(k + 1):
-        if refit and start is None and chosen:
+        if refit and chosen:
             search.fit(chosen)
-        if step == 0 or (refit and start is None):
+        if step == 0 or refit:
             base, each = search.information()
-            before, all_of_it = _log_det(base), _log_det(base + each.sum(axis=0))
-            states.append(search.state(base + each[chosen].sum(axis=0)))
+            before, whole_pool = _log_det(base), _log_det(base + each.sum(axis=0))
         M = base + each[chosen].sum(axis=0)
+        if step == 0 or refit:
+            states.append(State(search.model, search.p, search.s, np.linalg.inv(M)))
         if step:
-            shares.append((_log_det(M) - before) / max(all_of_it - before, 1e-300))
+            shares.append((_log_det(M) - before) / max(whole_pool - before, 1e-300))
         if step < k:
             more = _log_det(M + each) - _log_det(M)
             more[chosen] = -np.inf
@@ -215,16 +209,8 @@ def choose(
             chosen.append(int(np.argmax(more)) if by == "information" else next(drawn))
             gains.append(float(more[chosen[-1]]))
     new = tuple(chosen[first:])
-    return Choice(
-        indices=new,
-        gains=np.array(gains),
-        shares=np.array(shares),
-        logs=tuple(logs[i] for i in new if start is None),
-        places=tuple(places[i] for i in new),
-        states=tuple(states),
-        pool=n,
-        silent=tuple(map(int, np.flatnonzero(~each.any(axis=(1, 2))))),
-    )
+    found = tuple(logs[i] for i in new if start is None), tuple(places[i] for i in new)
+    return Choice(new, np.array(gains), np.array(shares), *found, tuple(states), n)
 
 
 def _log_det(M: Array) -> Any:
@@ -241,14 +227,14 @@ def _signals(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log],
         )
     logs, names, m = [], measured_names(plant), len(plant.inputs)
     for i, one in enumerate(pool):
-        u = reals(f"inputs of signal {i}", one)
+        u: Array = reals(f"inputs of signal {i}", one)
         u = u[:, None] if u.ndim == m == 1 else u
         if u.ndim != 2 or u.shape[1] != m or len(u) < 2 or not np.isfinite(u).all():
             raise SpecificationError(
                 f"signal {i} has the shape {u.shape}, but finite inputs of the shape (N, {m}), N "
                 f"at least 2, are expected: correct it."
             )
-        piece = Piece(np.arange(len(u)) * plant.dt, np.zeros((len(u), len(names))), u)
+        piece = Piece(plant.dt * np.arange(float(len(u))), np.zeros((len(u), len(names))), u)
         logs.append(Log.of_pieces(names, [*plant.inputs], [piece]))
     return logs, [f"signal {i}" for i in range(len(logs))]
 
@@ -302,60 +288,46 @@ class _Search:
         given: Plant | Fitted,
         logs: Sequence[Log],
         start: Array | None,
-        seconds: float | None,
-        longest: float | None,
-        width: int,
-        weight: float,
         hold: str,
-        seed: int,
+        *lengths: float | None,
     ) -> None:
-        self.n, self.start, self.weight = len(logs), start, weight
         fitted = given if isinstance(given, Fitted) else None
         self.plant = given.plant if isinstance(given, Fitted) else measuring(given, logs)
-        hold = fitted.hold if fitted else hold
-        deviations = fitted.data.deviations if fitted else None
-        self.data = data_of(self.plant, logs, "zero" if start is not None else hold, deviations)
-        rows = self._rows(logs, seconds, longest)
-        self.owners = np.repeat(np.arange(self.n), [len(one) for one in rows])
-        both = np.concatenate(rows)
+        self.n, self.known_start = len(logs), start is not None
+        hold = "zero" if self.known_start else fitted.hold if fitted else hold
+        self.data = data_of(self.plant, logs, hold)
+        self.noise, rows = self.data.deviations, self._rows(logs, *lengths)
         if fitted:
             self.physics, self.model = fitted.physics.model, fitted.chosen.model
             self.constants, self.p = fitted.physics.solution.p, fitted.chosen.solution.p
             self.s = self.weight = fitted.chosen.s
-            own = fitted.chosen.solution.windows.rows
-            self.owners = np.concatenate([np.full(len(own), -1), self.owners])
-            both = np.concatenate([own, both + len(fitted.data.time)])
+            before = len(fitted.data.time)
+            rows = [fitted.chosen.solution.windows.rows, *(each + before for each in rows)]
             self.data = _joined(fitted.data, self.data)
         else:
             delay, lag = self.plant.delay, self.plant.lag
-            self.physics = Model(
+            self.physics = self.model = Model(
                 self.plant,
                 delay=first_guess(delay),
                 free_delay=isinstance(delay, Unknown),
                 free_lag=isinstance(lag, Unknown),
             )
-            self.model, self.p = self.physics, self.physics.prior
-            self.constants, self.s = self.p, 1.0
+            self.constants, self.p, self.s = self.model.prior, self.model.prior, 1.0
+        both = np.concatenate(rows)
+        owners = np.arange(-1 if fitted else 0, self.n)
+        self.owners = np.repeat(owners, [len(each) for each in rows])
+        self.free = (self.owners < 0) | (not self.known_start)  # windows of an unknown start
         self.windows = Windows(both, first_states(self.data, self.model, both))
         if start is not None:
-            self.windows.starts[self.owners >= 0] = start
+            self.windows.starts[~self.free] = start
         self._settle()
-        if width and not fitted:
-            layout = layout_of(self.physics, self.data, self.p, self.windows)
-            self.model, self.s = self.physics.with_network(width, layout, seed), weight
-            self.p = self.model.extended(self.p, self.physics)
-        if not self.model.q:
-            raise SpecificationError(
-                "the plant has no unknown constant, delay or lag and there is no network, but "
-                "something to learn is expected: declare one with dopt.unknown(), or give a width."
-            )
 
     def _rows(
         self, logs: Sequence[Log], seconds: float | None, longest: float | None
     ) -> list[Integers]:
         """Return first and last rows of the windows of each candidate, (w, 2)."""
         ends = [(int(one[0]), int(one[-1])) for one in rows_of_logs(self.data, logs)]
-        if self.start is not None:
+        if self.known_start:
             return [np.array([both]) for both in ends]
         step = float(np.median([log.step for log in logs]))
         default = max(LENGTHS[2] * time_scale(self.data), FEWEST_ROWS * step)
@@ -365,59 +337,64 @@ class _Search:
         skip, ahead = _margins(self.plant, step)
         return [windows_of(self.data, *both, length, skip=skip, ahead=ahead) for both in ends]
 
-    def _settle(self) -> None:
-        """Move the initial states that are free to where they fit best."""
-        simulator, free = Simulator(self.model, self.data), self._free()
-        if free.any():
-            found = simulator.settled(self.p, self.windows.where(free))
-            self.windows.starts[free] = found.starts
+    def add_network(self, width: int, weight: float, seed: int) -> None:
+        """Add a network to the model of a plant that was not fitted."""
+        if width and not (self.owners < 0).any():
+            layout = layout_of(self.physics, self.data, self.p, self.windows)
+            self.model = self.physics.with_network(width, layout, seed)
+            self.s = self.weight = weight
+            self.p = self.model.extended(self.p, self.physics)
+        if not self.model.q:
+            raise SpecificationError(
+                "the plant has no unknown constant, delay or lag and there is no network, but "
+                "something to learn is expected: declare one with dopt.unknown(), or give a width."
+            )
 
-    def _free(self) -> Booleans:
-        """Return which windows begin at a state that is unknown."""
-        free: Booleans = self.owners < (0 if self.start is not None else self.n)
-        return free
+    def _settle(self) -> None:
+        """Move the initial states that are unknown to where they fit best."""
+        if self.free.any():
+            simulator = Simulator(self.model, self.data)
+            found = simulator.settled(self.p, self.windows.where(self.free))
+            self.windows.starts[self.free] = found.starts
 
     def fit(self, chosen: Sequence[int]) -> None:
         """Fit the constants, and then a network, to some candidates and to what was known."""
-        mine = np.isin(self.owners, [-1, *chosen])
-        if not mine.any():
+        windows = self.windows.where(np.isin(self.owners, [-1, *chosen]))
+        if not len(windows.rows):
             return
-        windows, physics = self.windows.where(mine), self.physics
-        found = solve(Simulator(physics, self.data), windows, self.constants, 1.0)
-        self.data = rescaled(self.plant, self.data, physics, found)
-        found = solve(Simulator(physics, self.data), found.windows, found.p, 1.0)
+        found = solve(Simulator(self.physics, self.data), windows, self.constants, 1.0)
+        left = rescaled(self.plant, self.data, self.physics, found).deviations
+        self.data = self.data._replace(deviations=np.maximum(left, self.noise))
+        found = solve(Simulator(self.physics, self.data), found.windows, found.p, 1.0)
         self.constants = self.p = found.p
-        if self.model is not physics:
+        if self.model is not self.physics:
             size = np.sqrt(np.median(found.squares / found.windows.counts(self.data)))
-            self.s, p = (
-                self.weight * max(float(size), 1e-300),
-                self.model.extended(found.p, physics),
+            self.s = self.weight * max(float(size), LEAST)
+            p, simulator = (
+                self.model.extended(found.p, self.physics),
+                Simulator(self.model, self.data),
             )
-            simulator = Simulator(self.model, self.data)
             self.p = solve(simulator, found.windows, p, self.s, scale=found.scale).p
         self._settle()
 
     def information(self) -> tuple[Array, Array]:
-        """Return I and the information of what was known, (q, q), and that of each, (n, q, q)."""
+        """Return I and the information of what was known, (q, q), and of each, (n, q, q)."""
         q, simulator = self.model.q, Simulator(self.model, self.data)
-        out, free = np.zeros((self.n + 1, q, q)), self._free()
-        windows, owners = self.windows.where(free), self.owners[free] + 1
-        weights = np.full(len(owners), self.s**-2)
-        found = simulator.linear(self.p, windows, weights, owners=owners).parts
-        out[: len(found)] = found
-        for i in np.flatnonzero(~free):
-            _, S = simulator.slopes(self.p, *self.windows.rows[i], self.windows.starts[i])
+        out, windows = np.zeros((self.n + 1, q, q)), self.windows.where(self.free)
+        weights, owners = np.full(len(windows.rows), self.s**-2), self.owners[self.free] + 1
+        parts = simulator.linear(self.p, windows, weights, owners=owners).parts
+        out[: len(parts)] = parts
+        for i in np.flatnonzero(~self.free):
+            (first, last), start = self.windows.rows[i], self.windows.starts[i]
+            _, S = simulator.slopes(self.p, first, last, start)
             R = S[:, self.model.structure.measured, :q] / (self.s * self.data.deviations[:, None])
             out[self.owners[i] + 1] = np.einsum("tnq,tnr->qr", R, R) if np.isfinite(R).all() else 0
         return np.eye(q) + out[0], out[1:]
-
-    def state(self, M: Array) -> State:
-        """Return what is known, with information M."""
-        return State(self.model, self.p, self.s, np.linalg.inv(M))
 
 
 def _joined(a: Data, b: Data) -> Data:
     """Return the rows of both, with the deviations of the first."""
     n = len(a.time)
-    ends = (np.concatenate([x, y + n]) for x, y in zip(a[3:5], b[3:5], strict=True))
-    return Data(*map(np.concatenate, zip(a[:3], b[:3], strict=True)), *ends, a.deviations)
+    time, measured, inputs = map(np.concatenate, zip(a[:3], b[:3], strict=True))
+    ends = np.append(a.firsts, b.firsts + n), np.append(a.lasts, b.lasts + n)
+    return Data(time, measured, inputs, *ends, a.deviations)

@@ -113,7 +113,9 @@ def table(found: pd.DataFrame) -> TextTable:
     lines = []
     for q, own in found.groupby("parameters"):
         seeds = [each for _, each in own.groupby("seed")]
-        pairs = [[reached(s[by], FACTOR * s["all"].iloc[0]) for by in KINDS] for s in seeds]
+        pairs = [
+            [reached(s[by].to_numpy(), FACTOR * s["all"].iloc[0]) for by in KINDS] for s in seeds
+        ]
         lines.append(_line(f"{q}", f"segments until {FACTOR:g} × the error of all", pairs))
         for n in AFTER:
             at = own[own.segments == n]
