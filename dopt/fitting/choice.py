@@ -6,10 +6,9 @@ are expected. One after the other is taken the candidate that raises most
 
     log det(I + Σ JᵀJ)
 
-over what was taken before and it: the entropy of the parameters falls by half of that. The initial
-state of a recorded window is unknown, and what it could explain is taken out of J; a signal begins
-at a state that is given. Where the model is not fitted again in between, the sum is at least
-1 - 1/e of the largest one of as many candidates, because log det is submodular.
+over what was taken before and it. What the unknown initial state of a recorded window could explain
+is taken out of J; a signal begins at a state that is given. Without fits in between, the sum is at
+least 1 - 1/e of the largest of as many candidates, because log det is submodular.
 
 References: V. Fedorov, "Theory of optimal experiments" (1972); G. Nemhauser, L. Wolsey and
 M. Fisher, "An analysis of approximations for maximizing submodular set functions" (1978).
@@ -241,6 +240,7 @@ def _signals(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log],
 
 def _recorded(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log], list[str]]:
     """Return logs, or segments of them, and where they are."""
+    pool = pool if isinstance(pool, list | tuple) else [pool]
     if any(isinstance(one, np.ndarray) for one in pool):
         raise SpecificationError(
             "the pool holds arrays, but logs are expected, or signals with the state at which they "
@@ -335,7 +335,13 @@ class _Search:
         if seconds is not None:
             length = seconds / math.ceil(seconds / length - 1e-9) - 0.5 * step
         skip, ahead = _margins(self.plant, step)
-        return [windows_of(self.data, *both, length, skip=skip, ahead=ahead) for both in ends]
+        rows = [windows_of(self.data, *both, length, skip=skip, ahead=ahead) for both in ends]
+        if not any(map(len, rows)):
+            raise SpecificationError(
+                f"no candidate has a window of {length:.3g} s between {skip:.3g} s after it begins "
+                f"and {ahead:.3g} s before it ends, but one at least is expected: give longer logs."
+            )
+        return rows
 
     def add_network(self, width: int, weight: float, seed: int) -> None:
         """Add a network to the model of a plant that was not fitted."""

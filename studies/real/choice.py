@@ -57,12 +57,8 @@ def main(words: Sequence[str] | None = None) -> int:
         dopt.Log.for_plant(part, PLANT, CASES["disk"].columns)
         for part in parts("disk", options.data).values()
     ]
-    found = []
-    for seed in range(100, 100 + options.seeds):
-        for width in WIDTHS:
-            found.append(curves(logs, seed, width))
-            tell(sys.stderr, f"seed {seed}, {width} units\n")
-    rows = pd.concat(found)
+    seeds = range(100, 100 + options.seeds)
+    rows = pd.concat([curves(logs, seed, width) for seed in seeds for width in WIDTHS])
     tell(sys.stdout, table(rows).markdown() + "\n")
     outputs.write_table(rows, options.out, "choice")
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from dopt.fitting.choice import Choice
 from dopt.log import Piece
 from dopt.types import Array
 from tests.dopt.fitting.test_fit import declared, run
+from tests.paths import ROOT
 
 DT = 1 / 64
 NOISE = 0.02
@@ -169,7 +171,7 @@ def test_a_refit_finds_the_constants_in_the_segments_that_move() -> None:
     assert abs(value - 24.0) < 0.2
     assert error < 0.2 * before
     assert "of 56 candidates, 5 parameters" in found.report()
-    fitted = dopt.fit(declared(), [*found.logs], width=0, window=0.9)
+    fitted = dopt.fit(declared(), [*found.logs], width=0, window=0.6)
     assert len(fitted.chosen.solution.windows.rows) == 4
 
 
@@ -206,6 +208,16 @@ def test_a_signal_that_leaves_the_limit_tells_nothing() -> None:
     assert found.indices == (1,)
 
 
+def test_the_example_of_the_page_runs() -> None:
+    page = (ROOT / "docs/fitting.md").read_text()
+    (code,) = (
+        block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "choose" in block
+    )
+    given = {"plant": declared(), "logs": [run(seed, 600) for seed in range(3)]}
+    exec(code, given)
+    assert given["best"] in range(50)
+
+
 LOGS = logs_of_motor(0)
 
 
@@ -220,6 +232,8 @@ LOGS = logs_of_motor(0)
         ({"by": "informaton"}, "did you mean 'information'"),
         ({"pool": []}, "no log was given"),
         ({"pool": [np.zeros((9, 1))]}, "the pool holds arrays, but logs are expected"),
+        ({"pool": LOGS[0], "k": 2}, "at most 1 in all"),
+        ({"window": 9.0}, "no candidate has a window of 9 s"),
         ({"seconds": 99.0}, "seconds is 99, but segments"),
         ({"width": -1}, "width is -1"),
         ({"weight": 0.0}, r"weight is 0\.0"),
@@ -234,6 +248,12 @@ LOGS = logs_of_motor(0)
     ],
 )
 def test_what_cannot_be_chosen_is_said(changed: dict[str, object], said: str) -> None:
-    given: dict[str, object] = {"plant": motor(), "pool": LOGS, "k": 1, "width": 0} | changed
+    given: dict[str, object] = {
+        "plant": motor(),
+        "pool": LOGS,
+        "k": 1,
+        "width": 0,
+        "window": 0.5,
+    } | changed
     with pytest.raises(SpecificationError, match=said):
         dopt.choose(**given)  # type: ignore[arg-type]  # of several types
