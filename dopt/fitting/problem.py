@@ -12,7 +12,6 @@ few of those in a window are independent. A step is taken by the method of Leven
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -56,6 +55,7 @@ class Linear(NamedTuple):
     C: Array  # (k, d, q)
     g: Array  # (k, d)
     scores: Array | None  # (k, q) Rᵀe of each window
+    parts: Array  # (n, q, q) Σ RᵀR of the windows of each owner
 
 
 class Windows(NamedTuple):
@@ -169,10 +169,12 @@ class Simulator:
         *,
         scores: bool = False,
         starts_only: bool = False,
+        owners: Integers | None = None,
     ) -> Linear:
         """Return the problem linearised at p, with a weight for each window's squares.
 
-        With ``starts_only`` it is linearised by the initial states alone, q = 0.
+        With ``starts_only`` it is linearised by the initial states alone, q = 0. With the number of
+        the owner of each window, its part of the sum is returned as well.
         """
         model, data, d = self.model, self.data, self.model.d
         q, work = (0, self._starts) if starts_only else (model.q, self._sharp)
@@ -182,6 +184,7 @@ class Simulator:
         squares = np.empty(k)
         T, C, g = np.empty((k, d, d)), np.empty((k, d, q)), np.empty((k, d))
         each = np.zeros((k, q)) if scores else None
+        parts = np.zeros((0 if owners is None else int(np.max(owners, initial=-1)) + 1, q, q))
         roots = np.sqrt(weights)
         sizes = (windows.rows[:, 1] - windows.rows[:, 0] + 1) * self.channels
         states, Q = np.empty((windows.longest, d)), np.empty((windows.longest * self.channels, d))
@@ -198,13 +201,15 @@ class Simulator:
             if q:
                 normal = blas.dsyrk(1.0, R.T, beta=1.0, c=normal, overwrite_c=True)
                 slope += e @ R
-            if each is not None:
-                ends = np.concatenate([[0], np.cumsum(sizes[part])])
-                for i in range(last - first):
-                    own = slice(ends[i], ends[i + 1])
+            ends = np.concatenate([[0], np.cumsum(sizes[part])])
+            for i in range(last - first if scores or owners is not None else 0):
+                own = slice(ends[i], ends[i + 1])
+                if each is not None:
                     each[first + i] = e[own] @ R[own]
+                if owners is not None:
+                    parts[owners[first + i]] += R[own].T @ R[own]
         normal = np.triu(normal) + np.triu(normal, 1).T
-        return Linear(normal, slope, squares, T, C, g, each)
+        return Linear(normal, slope, squares, T, C, g, each, parts)
 
 
 def _batches(sizes: Integers) -> list[tuple[int, int]]:
@@ -315,12 +320,21 @@ def call(function: Any, *arguments: Any) -> Any:
     """Call a compiled function, with the known part as a pointer: it is compiled once for all."""
     if PLAIN:
         return function(*arguments)
-    return _code(function, tuple(map(_kind, arguments)))(*arguments)
+    key = function, *map(_key, arguments)
+    if key not in _codes:
+        _codes[key] = function.compile(tuple(map(_kind, arguments)))
+    return _codes[key](*arguments)
 
 
-@functools.cache
-def _code(function: Any, kinds: tuple[Any, ...]) -> Any:
-    return function.compile(kinds)
+_codes: dict[Any, Any] = {}
+
+
+def _key(value: Any) -> Any:
+    """Return what decides the type of an argument, which takes Numba far longer to tell."""
+    if isinstance(value, np.ndarray):
+        f = value.flags
+        return value.dtype.char, value.ndim, f.c_contiguous, f.f_contiguous, f.writeable
+    return (type(value), *map(_key, value)) if isinstance(value, tuple) else type(value)
 
 
 def _kind(value: Any) -> Any:
