@@ -129,7 +129,7 @@ def conclusions_states(rows: pd.DataFrame | None = None) -> str:
     rows = read() if rows is None else rows
     body = []
     for policy, title in INPUTS.items():
-        for learner in ("adam_window", "evidence"):
+        for learner in LEARNERS:
             cells = []
             for env in SYSTEMS:
                 cell = env, "ideal", policy, learner

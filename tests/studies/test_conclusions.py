@@ -52,6 +52,19 @@ def test_the_sentences_of_the_page() -> None:
     rows = tables.read()
     share = tables.losses(rows, "cartpole", "ideal", "d_optimal", "adam_window", column="resonant")
     assert share.mean() == pytest.approx(0.14, abs=0.005)
+    for learner, known in (("adam_window", 2), ("gauss_newton", 3), ("evidence", 3)):
+        spaced = 0
+        for env in trials.SYSTEMS:
+            gaps = [
+                tables.losses(rows, env, "ideal", policy, learner, column="gap").mean()
+                for policy in tables.INPUTS
+            ]
+            spaced += gaps[0] == np.nanmin(gaps)
+        assert spaced == known
+    for policy in tables.RIVALS:
+        assert geometric(losses("pendulum", "encoder", policy, "evidence")) < geometric(
+            losses("pendulum", "encoder", "d_optimal", "evidence")
+        )
 
 
 @pytest.mark.parametrize("plant", ["ideal", *trials.PLANTS])
