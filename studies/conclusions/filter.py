@@ -1,7 +1,7 @@
 """Whether the intervals of the filter over state and parameters hold, and what its noise leaves.
 
 Angles and places are measured with noise, rates are not. A state's interval has the variance of
-P + Ψ M⁻¹ Ψᵀ. A prediction is that of the acceleration at the true state; its interval has the
+P + Ψ M⁻¹ Ψᵀ. What is predicted is the acceleration at the true state; its interval has the
 variance ρ + g M⁻¹ gᵀ.
 """
 
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dopt.kernel.learners.joint_kalman import acceleration_variances, run_filter
+from dopt.kernel.learners.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.offline_fit import HALF_WIDTH, Samples, fit_offline, jacobian
 from dopt.spec.trial import TrialSpec
@@ -116,13 +116,17 @@ def _intervals(run: KernelTrial, t: int) -> tuple[float, float, float]:
     """Return eᵀ S⁻¹ e / d, and the shares of states and accelerations within their intervals."""
     state, x = run.trial.state, run.record.true_states[t]
     error, psi = x - run.record.states[t], state.estimate.sensitivity
-    S = state.estimate.covariance + psi @ inverse_information(run) @ psi.T
-    nees = float(error @ np.linalg.solve(S, error)) / len(error)
+    inverse = inverse_information(run)
+    S = state.estimate.covariance + psi @ inverse @ psi.T
+    weighted = float(error @ np.linalg.solve(S, error)) / len(error)
     within = np.abs(error) <= HALF_WIDTH * np.sqrt(np.diag(S))
     system, model = run.spec.system, run.spec.model
-    missed = model.predict(system, run.parameters, x[None]) - system.learned(x[None], t)
-    known = np.abs(missed[0]) <= HALF_WIDTH * np.sqrt(acceleration_variances(run.trial, x))
-    return nees, float(within.mean()), float(known.mean())
+    truth = system.learned(x[None], t)
+    g = jacobian(run.spec, run.parameters, Samples(x[None], np.zeros((1, 1)), truth))[0]
+    variances = state.estimate.noise_variance[0] + np.diag(g @ inverse @ g.T)
+    missed = model.predict(system, run.parameters, x[None]) - truth
+    known = np.abs(missed[0]) <= HALF_WIDTH * np.sqrt(variances)
+    return weighted, float(within.mean()), float(known.mean())
 
 
 def inverse_information(run: KernelTrial) -> Matrix:

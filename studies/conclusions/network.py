@@ -101,7 +101,7 @@ class Network:
         w = form.width
         self.shapes = [(r, p), (w, p), (w,), (w, w), (w,), (r, w), (r,)]
         groups: list[Integers] = []
-        self.outputs: list[Integers] = []  # groups whose unit is that of the accelerations
+        self.outputs: list[Integers] = []  # groups in the unit of the accelerations
         for k, shape in enumerate(self.shapes):
             first = int(groups[-1].max()) + 1 if groups else 0
             own = np.arange(p) if k < 2 and form.by_feature else np.zeros(shape[-1], dtype=int)

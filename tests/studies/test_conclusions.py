@@ -8,12 +8,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dopt.kernel.run import KernelTrial
+from dopt.randomness import draw
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from dopt.systems.properties import eigenmode
+from studies.conclusions import filter as joint_filter
 from studies.conclusions import network, tables, trials
 from studies.conclusions.__main__ import PARTS, complete, main
 from studies.conclusions.trials import Cell, Row
+from tests.dopt.oracles.test_joint_kalman import filtered
+from tests.dopt.trials import trial
 from tests.pages import DOCS
 
 KEYS = tables.KEYS
@@ -146,6 +151,23 @@ def test_the_network_finds_which_features_matter() -> None:
 def test_the_products_of_features() -> None:
     found = network.products(np.array([[2.0, 3.0]]), 3)
     assert found.tolist() == [[2, 3, 4, 6, 9, 8, 12, 18, 27]]
+
+
+def test_the_intervals_are_of_the_filter_over_both_at_once() -> None:
+    env = {"horizon": 15, "measured_states": [0, 2], "measurement_noise": [1e-2, 2e-2]}
+    learner = {"name": "joint_ekf", "refit_every": 1000}
+    spec = trial("arm", "random", 4, env=env, model={"width": 3, "depth": 1}, learner=learner)
+    run = KernelTrial(spec)
+    run.advance(15)
+    outputs = run.record.true_states[1:] @ spec.system.output_rows.T + draw(spec).measurement_noise
+    states, _, variances = filtered(spec, outputs, run.record.inputs)
+    d = spec.system.n_states
+    inverse = joint_filter.inverse_information(run)
+    assert np.diag(inverse) == pytest.approx(variances[d:], rel=1e-5)
+    weighted, within, _ = joint_filter._intervals(run, 15)
+    error = run.record.true_states[15] - states[15]
+    assert within == np.mean(np.abs(error) <= 1.645 * np.sqrt(variances[:d]))
+    assert weighted > np.max(error**2 / variances[:d]) / d * (1 - 1e-6)  # of all at once
 
 
 def test_the_sentences_about_the_filter() -> None:
