@@ -504,7 +504,7 @@ TABLES: dict[str, Callable[[], str]] = {
     )
 }  # fmt: skip
 TABLES |= code_tables.TABLES
-TABLES |= {made.__name__: made for made in conclusions.TABLES}
+TABLES |= {made.__name__: made for made in (*conclusions.TABLES, *conclusions.OTHERS)}
 
 
 def with_tables(text: str) -> str:
