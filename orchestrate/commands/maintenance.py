@@ -25,10 +25,17 @@ from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, length_of_time, path
 from orchestrate.store import RETRIED, Reader, Store
 from orchestrate.store.doctor import Finding, examine
-from orchestrate.store.maintenance import Prunable, back_up, merge_collected, prunable, vacuum
+from orchestrate.store.maintenance import (
+    Prunable,
+    Upgrade,
+    back_up,
+    merge_collected,
+    prunable,
+    upgrade,
+    vacuum,
+)
 from orchestrate.store.merge import Merged, TrialName, merge
 from orchestrate.store.records import utc_text
-from orchestrate.store.upgrade import Upgrade, upgrade
 
 MAX_LISTED = 10
 """Trials of a kind that are listed; the JSON has all of them."""

@@ -22,7 +22,7 @@ from sqlalchemy import Connection, Double, LargeBinary
 from sqlalchemy.types import Integer
 
 from orchestrate.store import schema
-from orchestrate.store.backends.driver_errors import translated_file
+from orchestrate.store.backends.base import translated_file
 from orchestrate.store.backends.sqlite_engine import driver_of, filling_engine
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import SchemaVersionError, StoreError, StoreUnavailableError

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from orchestrate.store import database_url, packed_curves
+from orchestrate.store import database_url, records
 from orchestrate.store.errors import StoreUnavailableError
 from orchestrate.store.reader import Reader
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, SAMPLE_LOSS, STEP_VALUES
@@ -155,7 +155,7 @@ def _damaged_curves(moment: Reader) -> list[Finding]:
             1_000, f"SELECT trial_id, {', '.join(STEP_VALUES)} FROM curve ORDER BY trial_id"
         )
         for trial_id, *arrays in rows
-        if any(not len(packed_curves.unpacked(one)) for one in arrays)
+        if any(not len(records.unpacked_curve(one)) for one in arrays)
     ]
     return _several("error", "trials with a packed curve that is damaged", damaged, _PACK_AGAIN)
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
-from orchestrate.store import database_url, packed_curves
+from orchestrate.store import database_url, records
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.doctor import TrialKey
@@ -332,7 +332,7 @@ class Target:
                     {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
                     for t, measure, value in one.curve.assessments
                 ]
-        packed_curves.write(self._connection, curves)
+        records.write_curves(self._connection, curves)
         for table, rows in (
             (attempt, attempts),
             (trajectory_table, trajectories),

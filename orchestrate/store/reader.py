@@ -17,10 +17,8 @@ from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 from dopt.errors import suggestion
 from orchestrate.store import database_url, schema
 from orchestrate.store.backends import postgresql, sqlite
-from orchestrate.store.backends.base import LaunchLife
-from orchestrate.store.backends.driver_errors import translated
+from orchestrate.store.backends.base import LaunchLife, translated
 from orchestrate.store.errors import QueryError
-from orchestrate.store.packed_curves import read_curves
 from orchestrate.store.records import (
     Assessments,
     ConfigRow,
@@ -29,6 +27,7 @@ from orchestrate.store.records import (
     Table,
     Trajectory,
     TrialRow,
+    read_curves,
     stored_json,
     unpack,
 )

@@ -1,8 +1,14 @@
-"""Interface of a database backend: the operations that differ between SQLite and PostgreSQL."""
+"""Interface of a database backend, and the errors of its driver as errors of this package.
+
+A backend has the operations that differ between SQLite and PostgreSQL. After a transient error
+waiting may help.
+"""
 
 from __future__ import annotations
 
+import errno
 import logging
+import sqlite3
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -11,9 +17,228 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, Engine, Select
+from sqlalchemy.exc import DBAPIError
 
-from orchestrate.store.backends.driver_errors import translated
-from orchestrate.store.records import Array
+from dopt.types import Array
+from orchestrate.store.errors import (
+    QueryError,
+    SchemaVersionError,
+    StoreError,
+    StoreUnavailableError,
+)
+
+# A lock held for too long, or a race between processes that open the file.
+_TRANSIENT_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
+
+# Classes and codes of the SQL standard and of PostgreSQL's appendix A.
+_TRANSIENT_STATES = (
+    "08",  # connection lost or refused
+    "40",  # deadlock, serialization failure: the transaction was the victim, not the cause
+    "53200",  # out of memory
+    "53300",  # too many connections
+    "55P03",  # lock not available
+    "57014",  # cancelled, as by a statement timeout
+    "57P01",  # shutting down
+    "57P02",  # crashed
+    "57P03",  # starting up
+    "57P05",  # an idle session was ended
+    "25P03",  # an idle transaction was ended
+)
+
+# During a connection attempt the driver has no code; only the text of the server distinguishes a
+# permanent refusal from a temporary one.
+_TEMPORARY_REFUSALS = (
+    "starting up",
+    "shutting down",
+    "recovery mode",
+    "not yet accepting connections",
+    "too many clients",
+    "too many connections",
+    "connection slots are reserved",
+    "terminating connection",
+)
+_UNKNOWN_HOST = ("failed to resolve host", "could not translate host name")
+
+
+def is_transient(error: BaseException | None, known_host: bool) -> bool:
+    """Return whether the same request may succeed later without any intervention.
+
+    ``known_host`` is True if the server has answered before: its name is valid then, and may be
+    unresolvable only for a while, such as during the restart of a container.
+    """
+    name = getattr(error, "sqlite_errorname", None)
+    if name is not None:
+        return str(name).startswith(_TRANSIENT_SQLITE)
+    state = getattr(error, "sqlstate", None)
+    if state is not None:
+        return str(state).startswith(_TRANSIENT_STATES)
+    return _is_psycopg_error(error) and _text_is_transient(str(error), known_host)
+
+
+def _is_psycopg_error(error: BaseException | None) -> bool:
+    return type(error).__module__.partition(".")[0] == "psycopg"
+
+
+def _text_is_transient(text: str, known_host: bool) -> bool:
+    if any(words in text for words in _UNKNOWN_HOST):
+        return known_host
+    return "FATAL:" not in text or any(words in text for words in _TEMPORARY_REFUSALS)
+
+
+_SQLITE = {
+    "SQLITE_BUSY": "another process has locked it for too long; find the process that has it open",
+    "SQLITE_CANTOPEN": "the file cannot be opened; check that its folder exists and is writable",
+    "SQLITE_CONSTRAINT": "its tables contradict each other, as after a deletion by hand; restore a "
+    "copy, or give another path",
+    "SQLITE_CORRUPT": "the file is damaged; restore a copy, or move it away and run again",
+    "SQLITE_FULL": "the disk is full; make room and run the same command again",
+    "SQLITE_IOERR": "reading or writing the disk failed; check the disk and run again",
+    "SQLITE_NOTADB": "the file is not a SQLite database any more; restore a copy, or move it away "
+    "and run again",
+    "SQLITE_READONLY": "the file is read-only; make it writable or give another path",
+}
+_STATES = {
+    "23": "its tables contradict each other, as after a deletion by hand; restore a backup",
+    "28": "the server rejects this user; check the name and the password",
+    "2B": "another view depends on a view of this program; drop it and create it again later",
+    "3F": "its schema does not exist; create it or correct the search path",
+    "42501": "the user lacks a permission; request the right to create and write tables",
+    "25006": "the server is read-only, as a standby is; give the address of its primary",
+    "53100": "the server's disk is full; make room and run the same command again",
+    "58": "reading or writing the server's disk failed; check it and run again",
+    "XX": "the server found damaged data; restore a backup",
+}
+_WRONG_PLACE = (
+    errno.EACCES,
+    errno.EEXIST,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EPERM,
+)
+_OUT_OF_TIME = ("SQLITE_INTERRUPT", "57014")
+_NOT_OF_THE_QUERY = (*(name for name in _SQLITE if name != "SQLITE_READONLY"), "08", "53", "57P")
+# Names instead of classes, so that a driver that is not installed is not imported.
+_DRIVERS = ("sqlite3", "psycopg")
+_KINDS = ("OperationalError", "InterfaceError", "InternalError", "IntegrityError")
+_NOT_YET_ALLOWED = ("42501", "3F000")
+_REFUSED = "its server refuses the connection; see the reason in brackets"
+_ELSEWHERE = "check that its server runs and answers, then run the same command again"
+
+
+@contextmanager
+def translated(safe_url: str, known_host: bool = False, opening: bool = False) -> Iterator[None]:
+    """Raise ``StoreUnavailableError`` for errors of the database, not of the program.
+
+    ``known_host`` is True if the server has answered this process before. While a database is
+    opened, ``opening``, a file of something else is the mistake of whoever has named it: a
+    ``SchemaVersionError`` is raised. Errors are wrapped by SQLAlchemy, or raised directly by the
+    driver in COPY and in backups.
+    """
+    try:
+        yield
+    except Exception as error:
+        original = error.orig if isinstance(error, DBAPIError) else error
+        if original is None or not _is_infrastructure(original):
+            raise
+        if opening and _code(original) == "SQLITE_NOTADB":
+            raise SchemaVersionError(
+                f"{safe_url} is not a SQLite database, but a results database of this program is "
+                "expected: give the URL of another one, or of a new one, or restore a copy if it "
+                "was one."
+            ) from error
+        raise StoreUnavailableError(
+            f"The results database {safe_url} cannot be used: {_advice(original)} "
+            f"({_first_line(original)}).",
+            transient=is_transient(original, known_host),
+        ) from error
+
+
+@contextmanager
+def translated_file(safe_url: str) -> Iterator[None]:
+    """Raise ``StoreUnavailableError`` if a file beside the database cannot be used.
+
+    If no such file can ever be created, the URL is wrong: a ``StoreError`` is raised.
+    """
+    try:
+        yield
+    except OSError as error:
+        kind = StoreError if error.errno in _WRONG_PLACE else StoreUnavailableError
+        raise kind(
+            f"The results database {safe_url} needs {error.filename or 'files beside it'}, which "
+            f"cannot be made or opened ({error.strerror}): make its folder writable, make room, "
+            "or give another path."
+        ) from error
+
+
+@contextmanager
+def translated_query(safe_url: str, seconds: float | None = None) -> Iterator[None]:
+    """Raise ``QueryError`` for an SQL query of the user that the database rejects.
+
+    ``seconds`` is its time limit.
+    """
+    with translated(safe_url):
+        try:
+            yield
+        except DBAPIError as error:
+            code = _code(error.orig)
+            if code in _OUT_OF_TIME:
+                raise out_of_time(seconds) from error
+            if code.startswith(_NOT_OF_THE_QUERY) or (not code and _is_infrastructure(error.orig)):
+                raise
+            refused = code == "SQLITE_AUTH"
+            reason = "only a SELECT is allowed" if refused else _first_line(error.orig)
+            raise QueryError(f"The query failed on {safe_url}: {reason}.") from error
+
+
+def out_of_time(seconds: float | None) -> QueryError:
+    """Return the error of a query that was ended after ``seconds``."""
+    return QueryError(
+        f"The query took longer than {seconds or 0:g} s and was cancelled: make it smaller, or "
+        "increase its time limit."
+    )
+
+
+def is_of_driver(error: BaseException) -> bool:
+    """Return whether a database driver raised the error."""
+    return any(base.__module__.partition(".")[0] in _DRIVERS for base in type(error).__mro__)
+
+
+def _code(original: BaseException | None) -> str:
+    name = getattr(original, "sqlite_errorname", None)
+    return str(name or getattr(original, "sqlstate", None) or "")
+
+
+def _is_infrastructure(original: BaseException | None) -> bool:
+    if getattr(original, "sqlstate", None) in _NOT_YET_ALLOWED:
+        return True
+    # sqlite3 raises the base class itself only for a damaged file.
+    return type(original) is sqlite3.DatabaseError or any(
+        base.__name__ in _KINDS and base.__module__.partition(".")[0] in _DRIVERS
+        for base in type(original).__mro__
+    )
+
+
+def _advice(original: BaseException) -> str:
+    name = getattr(original, "sqlite_errorname", None)
+    if name is None:
+        return _server_advice(original)
+    primary = "_".join(name.split("_")[:2])  # SQLITE_IOERR_WRITE -> SQLITE_IOERR
+    return _SQLITE.get(primary, "SQLite refused; see the reason in brackets")
+
+
+def _server_advice(original: BaseException) -> str:
+    state = getattr(original, "sqlstate", None)
+    if state is None:
+        return _REFUSED if "FATAL:" in str(original) else _ELSEWHERE
+    return next((text for code, text in _STATES.items() if state.startswith(code)), _ELSEWHERE)
+
+
+def _first_line(original: BaseException | None) -> str:
+    lines = str(original).strip().splitlines()
+    return (lines[0] if lines else type(original).__name__).rstrip(".")
+
 
 ANNOUNCE_SECONDS = 2.0
 """Wait for a lock of another process after which a warning says who holds it."""

@@ -17,15 +17,15 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from orchestrate.store import database_url
 from orchestrate.store.backends.backups import back_up_to, copy_checked, rescue
-from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
-from orchestrate.store.backends.driver_errors import translated_file
-from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
-from orchestrate.store.backends.network_file_systems import refuse_unsafe
+from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial, translated_file
 from orchestrate.store.backends.sqlite_engine import (
+    LaunchLocks,
     driver_of,
     existing_path,
+    file_lock,
     read_address,
     read_engine,
+    refuse_unsafe,
     watcher,
     write_engine,
     writer,

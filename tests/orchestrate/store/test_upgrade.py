@@ -20,10 +20,10 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store import upgrade as migration
-from orchestrate.store.backends.file_locks import LaunchLocks
+from orchestrate.store import maintenance as migration
+from orchestrate.store.backends.sqlite_engine import LaunchLocks
+from orchestrate.store.maintenance import upgrade
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
-from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.conftest import each_version
 from tests.orchestrate.store.databases import (
     backups,
