@@ -28,15 +28,16 @@ from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread
 from analysis.stats.intervals import BandKind, Statistic
 from analysis.stats.scores import Measure
-from analysis.tables import sample_losses
 from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
+    SAMPLE_LOSS_HELP,
     TABLES,
     TableKind,
     TextTable,
     comparison,
     incomplete,
+    sample_loss_kind,
 )
 from dopt.errors import install_command
 from dopt.process import usable_cores
@@ -107,7 +108,7 @@ def parser() -> Parser:
         commands, "aggregate", _table, "every variant against the reference, over all systems"
     )
     calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP, diverged=False)
-    sampled = _command(commands, "sample-loss", _table, sample_losses.HELP, diverged=False)
+    sampled = _command(commands, "sample-loss", _table, SAMPLE_LOSS_HELP, diverged=False)
     sampled.add_argument("--store", action="store_true", help="keep what is fitted in the database")
     tables = {
         summary: lambda _: TABLES["summary"],
@@ -307,7 +308,7 @@ def _sampled(options: argparse.Namespace) -> TableKind:
             with Store.open(options.db) as store:
                 store.add_assessments(fitted)
 
-    return sample_losses.sample_loss_kind(lambda text: tell(sys.stderr, f"note: {text}\n"), keep)
+    return sample_loss_kind(lambda text: tell(sys.stderr, f"note: {text}\n"), keep)
 
 
 def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
@@ -335,8 +336,7 @@ def _serve(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
     _check_one_database(options)
     try:
-        from analysis.serve.app import create_app
-        from analysis.serve.server import Server
+        from analysis.serve.app import Server, create_app
     except ModuleNotFoundError as error:
         raise AnalysisError(
             f"The browser needs the library {error.name}: "

@@ -66,10 +66,10 @@ def run(options: argparse.Namespace) -> int:
         progress=lambda text: tell(sys.stderr, f"{text}\n"),
     )
     tell(sys.stdout, f"{found.report()}\n")
-    from analysis.figures.fitted import save  # Matplotlib: other commands do without it
+    from analysis.figures.reports import draw_fit  # Matplotlib: other commands do without it
 
     options.out.mkdir(parents=True, exist_ok=True)
-    save(found, (tests or logs)[0], options.out / "fit.png")
+    draw_fit(found, (tests or logs)[0], options.out / "fit.png")
     found.save(options.out / "model.npz")
     tell(sys.stdout, f"picture: {options.out / 'fit.png'}\nmodel: {options.out / 'model.npz'}\n")
     if options.db:

@@ -23,8 +23,8 @@ from analysis.figures.panels import (
     look,
     sheet,
 )
-from analysis.stats.control import ControlCurve, control_part, measure_control, tabulate_control
 from analysis.stats.curves import log_limits
+from analysis.stats.scores import ControlCurve, control_part, measure_control, tabulate_control
 from analysis.style import count_text, environment_title, policy_style, share, text_by_environment
 
 ROW_HEIGHT = 1.9

@@ -1,17 +1,315 @@
-"""Health of a log: sampling, and quantum, noise, range, limits and rest of each signal."""
+"""Health of a log: sampling, quantum, noise, limits and rest of signals, effects of the inputs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from analysis.logs.excitation import Effect, effects, rates
-from dopt.log import Log
+from dopt.log import Log, Piece
 from dopt.log_columns import TURN
 from dopt.types import Array, Booleans, Vector
+
+LAGS = np.arange(-3, 9)
+"""Samples by which the effect may come after the input."""
+
+WINDOWS = (2, 4, 8, 16, 32)
+"""Samples p to each side of the polynomials; the one in which most is explained is taken."""
+
+MOST_ROWS = 100_000
+"""Rows that are examined, the first ones of a longer log."""
+
+FOLLOWS = 0.005
+"""Share of an input's variance that the state leaves open, below which it follows the state."""
+
+TOLD_APART = 1.15
+"""Factor by which the next lags leave more unexplained, where a delay is told apart."""
+
+OWN = 0.2
+"""Share of an input's variance that the state leaves open, above which it varies on its own."""
+
+STEADY = 4.5
+"""Effect by its standard error, below which none is told apart."""
+
+FEEDBACK = 0.05
+"""Share of what an input's past leaves open that measurements explain, above which there is one."""
+
+PREDICTED = 0.9999
+"""Share of an input that its past tells, above which feedback is not told apart."""
+
+ROOM = 1.5
+"""Windows side by side for each feature of the state, below which too little is left to tell."""
+
+Response = tuple[float, int, Vector]
+"""Steadiness, state and explained shares (lags,) of an input in one window."""
+
+_LAG_BLOCKS = 16
+_PAST = 10  # samples of an input's past
+_RATE = re.compile(r"vel|rate|omega|speed|dot|^q?d[a-z]?\d*$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Effect of one input on the motion.
+
+    Attributes
+    ----------
+    input, state : str
+        The input, and the position on which it shows most.
+    explained : (lags,) array
+        Share of the motion that the state leaves open that the input explains, by :data:`LAGS`.
+    steadiness : float
+        The effect at the best lag by its standard error over blocks of the log.
+    delays : tuple of int, optional
+        First and last lag that fit about as well as the best [samples]; None where more than
+        three do.
+    open : float
+        Share of the input's variance that the state at the same time leaves open.
+    feedback : float
+        Share of what the input's own past leaves open that the measurements explain.
+    predicted : float
+        Share of the input that its own past tells.
+    """
+
+    input: str
+    state: str
+    explained: Vector
+    steadiness: float
+    delays: tuple[int, int] | None
+    open: float
+    feedback: float
+    predicted: float
+
+    @property
+    def follows_state(self) -> bool:
+        """Whether the input is a function of the state."""
+        return self.open < FOLLOWS
+
+    @property
+    def has_effect(self) -> bool:
+        """Whether an effect on the motion is told apart."""
+        return not self.follows_state and self.steadiness >= STEADY
+
+    @property
+    def explains_nothing(self) -> bool:
+        """Whether it follows the state, or varies on its own without an effect on the motion."""
+        return self.follows_state or (self.open > OWN and not self.has_effect)
+
+    @property
+    def closed_loop(self) -> bool:
+        """Whether the input answers to the measurements."""
+        feedback = self.feedback > FEEDBACK and self.predicted < PREDICTED
+        return self.follows_state or feedback
+
+
+def effects(log: Log) -> list[Effect]:
+    """Return the effect of each input that varies; none where the pieces are too short."""
+    pieces = list(_first_rows(log.pieces))
+    are_rates = rates(log)
+    found = []
+    for j, name in enumerate(log.inputs):
+        if all(np.ptp(piece.inputs[:, j]) == 0 for piece in pieces):
+            continue
+        tried = [
+            one for p in WINDOWS if (one := _best_response(pieces, are_rates, j, p)) is not None
+        ]
+        if tried:
+            steady = [one for one in tried if one[0] >= STEADY]
+            most = max(steady or tried, key=lambda one: one[2].max() if steady else one[0])
+            steadiness, i, explained = most
+            law = _law(pieces, j)
+            delays = None if law[0] < FOLLOWS else _delays(tried)
+            found.append(Effect(name, log.states[i], explained, steadiness, delays, *law))
+    return found
+
+
+def _delays(tried: Sequence[Response]) -> tuple[int, int] | None:
+    """Return the lags of the narrowest window that tells them apart: wide ones blur them."""
+    for steadiness, _, explained in tried:
+        left = 1.0 - explained
+        alike = np.flatnonzero(left <= TOLD_APART * left.min())
+        inner = alike[0] > 0 and alike[-1] < len(LAGS) - 1
+        if steadiness > STEADY and inner and np.ptp(alike) <= 2:
+            return int(LAGS[alike[0]]), int(LAGS[alike[-1]])
+    return None
+
+
+def _first_rows(pieces: Sequence[Piece]) -> Iterator[Piece]:
+    left = MOST_ROWS
+    for piece in pieces:
+        if left > 1:
+            yield Piece(*(part[:left] for part in piece))
+        left -= len(piece.time)
+
+
+def weights(p: int, derivative: int) -> Vector:
+    """Return the weights (2 p + 1,) of a derivative of the cubic through samples, by sample."""
+    powers = np.vander(np.arange(-p, p + 1.0), 4, increasing=True)
+    found: Vector = np.linalg.pinv(powers)[derivative] * (1, 1, 2)[derivative]
+    return found
+
+
+def rates(log: Log) -> list[bool]:
+    """Return which states are rates: by their names, or as they follow another one's slope."""
+    n, p = len(log.states), 8
+    found = [bool(_RATE.search(name)) for name in log.states]
+    pieces = _first_rows(log.pieces)
+    longest = max(pieces, key=lambda piece: len(piece.time)).measured
+    if len(longest) <= 4 * p:
+        return found
+    smooth, slopes = (_filtered(longest, weights(p, order)) for order in (0, 1))
+    there = np.isfinite(smooth).all(axis=1)
+    for i in range(n):
+        for j in range(n):
+            if i != j and np.ptp(smooth[there, j]) > 0 and np.ptp(slopes[there, i]) > 0:
+                alike = np.corrcoef(slopes[there, i], smooth[there, j])[0, 1]
+                found[j] |= bool(alike > 0.9)
+    return found
+
+
+def _filtered(values: Array, weight: Vector) -> Array:
+    """Return the weighted sums about each row that has all of them, (rows, columns)."""
+    return np.column_stack([np.convolve(one, weight[::-1], "valid") for one in values.T])
+
+
+def _best_response(
+    pieces: Sequence[Piece], are_rates: Sequence[bool], j: int, p: int
+) -> Response | None:
+    """Return steadiness, state and explained shares by lag of one input."""
+    only_rates = all(are_rates)
+    used = [i for i, rate in enumerate(are_rates) if only_rates or not rate]
+    rows = [
+        _rows(piece, used, only_rates, p)
+        for piece in pieces
+        if len(piece.time) > 4 * p + len(LAGS) + 8
+    ]
+    if not rows:
+        return None
+    state, motion, lagged = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    x = lagged[:, :, j]
+    others = [k for k in range(lagged.shape[2]) if k != j and not _alike(lagged[:, 3, [j, k]])]
+    features = np.column_stack([state, lagged[:, 3, others]])
+    if len(state) < ROOM * (2 * p + 1) * features.shape[1]:
+        return None
+    basis = _basis(features)
+    x_left = x - basis @ (basis.T @ x)
+    power = (x_left**2).sum(axis=0)
+    total = float(((x - x.mean(axis=0)) ** 2).sum(axis=0).mean())
+    if total == 0 or power.min() <= 1e-14 * total:
+        return None if total == 0 else (0.0, used[0], np.zeros(len(LAGS)))
+    left = motion - basis @ (basis.T @ motion)
+    unexplained = np.maximum((left**2).sum(axis=0), 1e-300)
+    explained = (x_left.T @ left) ** 2 / power[:, None] / unexplained  # (lags, states)
+    lag, place = np.unravel_index(int(explained.argmax()), explained.shape)
+    steadiness = _steadiness(x_left[:, lag], left[:, place])
+    return steadiness, used[int(place)], explained[:, place]
+
+
+def _alike(two: Array) -> bool:
+    """Return whether two inputs, (rows, 2), are the same apart from noise."""
+    one, other = two.T
+    still = np.ptp(one) == 0 or np.ptp(other) == 0
+    return bool(still or abs(np.corrcoef(one, other)[0, 1]) > 0.9)
+
+
+def _rows(
+    piece: Piece, used: Sequence[int], only_rates: bool, p: int
+) -> tuple[Array, Array, Array]:
+    """Return features of the state, accelerations, and averaged inputs at all lags, by row."""
+    measured, margin = piece.measured[:, used], int(np.abs(LAGS).max()) + 1
+    value, slope, bend = (
+        _filtered(measured, weights(p, order))[margin:-margin] for order in (0, 1, 2)
+    )
+    features: list[Any] = [np.ones(len(value)), value, value**2, np.sin(value), np.cos(value)]
+    if only_rates:
+        features += [np.sign(value), value * np.abs(value)]
+    else:
+        size = np.abs(slope)
+        features += [slope, np.sign(slope), slope * size]
+        features += [slope * np.sin(value), slope * np.cos(value)]
+        i, k = np.triu_indices(len(used), 1)  # coupled links
+        turned = value[:, i] - value[:, k]
+        features += [np.sin(turned), np.cos(turned)]
+    if only_rates:
+        motion, held = slope, piece.inputs
+        kernel = -np.cumsum(weights(p, 1))[:-1]
+    else:
+        motion = bend
+        held = np.vstack([piece.inputs[:1], (piece.inputs[1:] + piece.inputs[:-1]) / 2])
+        kernel = np.cumsum(np.cumsum(weights(p, 2)))[:-2]
+    averaged = _filtered(held, kernel)
+    first = p + margin - (p if only_rates else p - 1)  # its row of the first lag 0
+    n = len(value)
+    lagged = np.stack([averaged[first - lag : first - lag + n] for lag in LAGS], axis=1)
+    table = np.column_stack(features)
+    there = np.isfinite(table).all(axis=1) & np.isfinite(motion).all(axis=1)
+    return table[there], motion[there], lagged[there]
+
+
+def _basis(features: Array) -> Array:
+    """Return an orthonormal basis of what features span, (rows, rank)."""
+    scaled = features / np.maximum(np.sqrt((features**2).mean(axis=0)), 1e-300)
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    kept = values > 1e-11 * values[-1]
+    basis: Array = np.linalg.qr(scaled @ vectors[:, kept])[0]
+    return basis
+
+
+def _steadiness(x: Vector, motion: Vector) -> float:
+    """Return the slope of the motion over the input by its standard error, from blocks of rows."""
+    slope = float(x @ motion) / float(x @ x)
+    scores = x * (motion - slope * x)
+    sums = np.array([part.sum() for part in np.array_split(scores, _LAG_BLOCKS)])
+    error = float(np.sqrt((sums**2).sum())) / float(x @ x)
+    return abs(slope) / max(error, 1e-300)
+
+
+def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
+    """Return what the state leaves open of an input, what it adds to its past, and the past."""
+    rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
+    if not rows:
+        return 1.0, 0.0, 0.0
+    now, past, seen = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    if len(now) < 4 * (past.shape[1] + seen.shape[1]):
+        return 1.0, 0.0, 0.0
+    total = float(((now - now.mean()) ** 2).sum())
+    alone, n_alone = _left(past, now)
+    both, n_both = _left(np.column_stack([past, seen]), now)
+    left = _left(np.column_stack([past[:, 0], seen]), now)[0] / total
+    if alone <= 1e-12 * total:
+        return left, 0.0, 1.0
+    ratio = (both / (len(now) - n_both)) / (alone / (len(now) - n_alone))
+    return left, max(0.0, 1.0 - ratio), 1.0 - alone / total
+
+
+def _causal(piece: Piece, j: int) -> tuple[Vector, Array, Array]:
+    """Return an input, the past of all inputs, and measurements up to the same row, by row."""
+    n = len(piece.time)
+
+    def back(values: Array, lag: int) -> Array:
+        return values[_PAST - lag : n - lag]
+
+    now = back(piece.inputs[:, j], 0)
+    past = np.column_stack(
+        [np.ones(len(now)), *(back(piece.inputs, lag) for lag in range(1, _PAST + 1))]
+    )
+    state = back(piece.measured, 0)
+    recent = [back(piece.measured, lag) for lag in range(4)]
+    seen = np.column_stack([*recent, np.sin(state), np.cos(state)])
+    there = np.isfinite(seen).all(axis=1)
+    return now[there], past[there], seen[there]
+
+
+def _left(features: Array, values: Vector) -> tuple[float, int]:
+    """Return the sum of squares that features leave, and how many numbers were fitted."""
+    basis = _basis(features)
+    rest = values - basis @ (basis.T @ values)
+    return float(rest @ rest), basis.shape[1]
+
 
 PERIODS = (1.0, TURN, 360.0, *(1000.0 * k for k in (1, 2, 2.4, 4, 8, 10)), *2.0 ** np.arange(8, 17))
 """Periods at which angles wrap: turns, radians, degrees and counts."""

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from analysis.logs.excitation import MOST_ROWS, Effect
-from analysis.logs.health import FEW, Health, Signal, examine
+from analysis.logs.health import FEW, MOST_ROWS, Effect, Health, Signal, examine
 from analysis.logs.tables import is_flag, log_of, read_table
 from analysis.style import number
 from dopt.log import Log
@@ -72,9 +71,9 @@ def run(options: argparse.Namespace) -> int:
     guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
     for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table)):
         tell(sys.stdout, f"{line}\n")
-    from analysis.figures.log_health import save  # Matplotlib: other commands do without it
+    from analysis.figures.reports import draw_log  # Matplotlib: other commands do without it
 
-    save(log, health, target, file.name)
+    draw_log(log, health, target, file.name)
     tell(sys.stdout, f"picture: {target}\n")
     return 0
 

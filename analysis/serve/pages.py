@@ -39,8 +39,7 @@ from dopt.spec.label import flatten, labels
 from dopt.spec.trial import is_fit, is_prequential, system_of
 from dopt.systems import System
 from dopt.systems.properties import eigenmode
-from orchestrate.store import ConfigRow, LaunchRow, Reader, explorations, failure_kinds
-from orchestrate.store.errors import QueryError
+from orchestrate.store import ConfigRow, LaunchRow, QueryError, Reader, explorations, failure_kinds
 
 Array = npt.NDArray[np.float64]
 Content = dict[str, Any]

@@ -22,7 +22,6 @@ from analysis.data.matching import nearness
 from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError
-from analysis.stats.control import relative_costs, scores_at
 from analysis.stats.intervals import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
@@ -33,6 +32,8 @@ from analysis.stats.scores import (
     compare_hitting_times,
     final_losses,
     mean_losses,
+    relative_costs,
+    scores_at,
     steps_to,
     without_ratio,
 )

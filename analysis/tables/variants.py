@@ -30,16 +30,20 @@ from analysis.data.selection import (
     section_text,
 )
 from analysis.errors import AnalysisError
-from analysis.stats.control import TrueModel, common_task, measure_control, scores_at, task_of
 from analysis.stats.intervals import mean_columns
 from analysis.stats.scores import (
+    TrueModel,
     benjamini_hochberg,
     censored_median,
+    common_task,
     compare_hitting_times,
     final_losses,
     lasting_steps,
     mcnemar,
     mean_losses,
+    measure_control,
+    scores_at,
+    task_of,
     without_ratio,
 )
 from analysis.tables.comparisons import (

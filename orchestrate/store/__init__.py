@@ -8,9 +8,7 @@ What a command does to a whole database is in modules of their own: ``merge``, `
 
 from __future__ import annotations
 
-from orchestrate.records import URL_VARIABLE, Failure, RunRecord
-from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, default_url
-from orchestrate.store.errors import (
+from orchestrate.errors import (
     DatabaseMovedError,
     InvalidResultError,
     LaunchAliveError,
@@ -20,6 +18,8 @@ from orchestrate.store.errors import (
     StoreError,
     StoreUnavailableError,
 )
+from orchestrate.records import URL_VARIABLE, Failure, RunRecord
+from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, default_url
 from orchestrate.store.launches import OpenConfig, OpenTrial
 from orchestrate.store.reader import (
     ExplorationRow,

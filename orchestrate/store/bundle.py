@@ -21,11 +21,11 @@ import numpy as np
 from sqlalchemy import Connection, Double, LargeBinary
 from sqlalchemy.types import Integer
 
+from orchestrate.errors import SchemaVersionError, StoreError, StoreUnavailableError
 from orchestrate.store import schema
 from orchestrate.store.backends.base import translated_file
 from orchestrate.store.backends.sqlite_engine import driver_of, filling_engine
 from orchestrate.store.doctor import TrialKey
-from orchestrate.store.errors import SchemaVersionError, StoreError, StoreUnavailableError
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.records import DTYPE
 from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, curve, metadata

@@ -11,8 +11,8 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
 from dopt.errors import given_path, stripped
+from orchestrate.errors import StoreError
 from orchestrate.records import URL_VARIABLE
-from orchestrate.store.errors import StoreError
 
 DEFAULT_URL = "sqlite:///results/results.db"
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
+from orchestrate.errors import StoreUnavailableError
 from orchestrate.store import database_url, records
-from orchestrate.store.errors import StoreUnavailableError
 from orchestrate.store.reader import Reader
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, SAMPLE_LOSS, STEP_VALUES
 

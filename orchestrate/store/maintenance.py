@@ -19,6 +19,7 @@ from sqlalchemy import URL, Connection, bindparam, select, text, update
 
 from dopt.spec.config import REGISTRIES, section_class
 from dopt.spec.label import config_label
+from orchestrate.errors import NoDatabaseError, StoreError
 from orchestrate.files import whole
 from orchestrate.store import database_url, launches, records, schema
 from orchestrate.store.backends import sqlite
@@ -26,7 +27,6 @@ from orchestrate.store.backends.backups import copy_checked, dump
 from orchestrate.store.backends.base import Backend, translated, translated_file
 from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.doctor import TrialKey
-from orchestrate.store.errors import NoDatabaseError, StoreError
 from orchestrate.store.launches import refuse_living
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.reader import Reader

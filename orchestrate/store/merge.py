@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
+from orchestrate.errors import StoreError
 from orchestrate.store import database_url, records
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.doctor import TrialKey
-from orchestrate.store.errors import StoreError
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import DTYPE, Array, stored_json, unpack
 from orchestrate.store.results import insert_error, steps_ahead, unpacked

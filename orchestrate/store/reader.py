@@ -15,10 +15,10 @@ import numpy as np
 from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
+from orchestrate.errors import QueryError
 from orchestrate.store import database_url, schema
 from orchestrate.store.backends import postgresql, sqlite
 from orchestrate.store.backends.base import LaunchLife, translated
-from orchestrate.store.errors import QueryError
 from orchestrate.store.records import (
     Assessments,
     ConfigRow,

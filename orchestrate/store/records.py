@@ -42,8 +42,8 @@ from sqlalchemy import (
     text,
 )
 
+from orchestrate.errors import StoreError, StoreUnavailableError
 from orchestrate.store.backends.base import Backend
-from orchestrate.store.errors import StoreError, StoreUnavailableError
 from orchestrate.store.schema import FINISHED, N_ROWS, STEP_VALUES, Outcome, curve, step, trial
 
 Array = npt.NDArray[np.float64]

@@ -22,11 +22,10 @@ from sqlalchemy import (
     update,
 )
 
-from orchestrate.errors import without_password
+from orchestrate.errors import InvalidResultError, StoreError, without_password
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store import records
 from orchestrate.store.backends.base import Backend
-from orchestrate.store.errors import InvalidResultError, StoreError
 from orchestrate.store.launches import GridRows, begin_attempts, living, register, renew
 from orchestrate.store.records import (
     DTYPE,

@@ -37,7 +37,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from orchestrate.store.errors import SchemaVersionError
+from orchestrate.errors import SchemaVersionError
 
 SCHEMA_VERSION = 7
 """Number of the newest schema, the last of :data:`orchestrate.store.maintenance.STATEMENTS`."""

@@ -14,9 +14,8 @@ import pandas as pd
 import pytest
 
 import analysis
-from analysis.data.frames import STEP_COLUMNS
 from analysis.data.matching import Filter, defaults, nearness, newest
-from analysis.data.samples import learned_model, simulated_trial
+from analysis.data.samples import STEP_COLUMNS, learned_model, simulated_trial
 from analysis.data.selection import is_possible, select
 from analysis.errors import AnalysisError
 from analysis.figures.input_spectrum import measure_spectra, tabulate_spectra

@@ -19,8 +19,7 @@ from scipy.io import savemat
 import analysis
 from analysis import cli
 from analysis.errors import AnalysisError
-from analysis.logs.excitation import MOST_ROWS, Effect, effects
-from analysis.logs.health import Health, examine, quantum
+from analysis.logs.health import MOST_ROWS, Effect, Health, effects, examine, quantum
 from analysis.logs.report import lines
 from analysis.logs.tables import log_of, read_table
 from dopt.errors import SpecificationError

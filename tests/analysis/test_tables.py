@@ -25,15 +25,6 @@ from analysis.figures.control import caption_control, draw_control
 from analysis.figures.input_spectrum import caption, measure_spectra, tabulate_spectra
 from analysis.outputs import build
 from analysis.report import CAPTION, EXPLAINED
-from analysis.stats.control import (
-    ControlCurve,
-    control_part,
-    measure_control,
-    relative_costs,
-    scores_at,
-    tabulate_control,
-    true_model,
-)
 from analysis.stats.curves import (
     Axis,
     PlotOptions,
@@ -43,7 +34,16 @@ from analysis.stats.curves import (
     tabulate_curves,
     wrapped_line,
 )
-from analysis.stats.scores import Measure
+from analysis.stats.scores import (
+    ControlCurve,
+    Measure,
+    control_part,
+    measure_control,
+    relative_costs,
+    scores_at,
+    tabulate_control,
+    true_model,
+)
 from analysis.style import count_text, number, p_text, plus_minus, unit_of
 from analysis.tables.comparisons import compare_control, compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from sqlalchemy import URL
 
+from orchestrate.errors import StoreError, StoreUnavailableError
 from orchestrate.store import database_url
-from orchestrate.store.errors import StoreError, StoreUnavailableError
 
 PROGRAM = "pg_dump"
 

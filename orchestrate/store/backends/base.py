@@ -20,7 +20,7 @@ from sqlalchemy import Connection, Engine, Select
 from sqlalchemy.exc import DBAPIError
 
 from dopt.types import Array
-from orchestrate.store.errors import (
+from orchestrate.errors import (
     QueryError,
     SchemaVersionError,
     StoreError,

@@ -15,6 +15,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, Select, func, insert, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
+from orchestrate.errors import DatabaseMovedError, StoreError, StoreUnavailableError
 from orchestrate.store import database_url
 from orchestrate.store.backends.backups import back_up_to, copy_checked, rescue
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial, translated_file
@@ -30,7 +31,6 @@ from orchestrate.store.backends.sqlite_engine import (
     write_engine,
     writer,
 )
-from orchestrate.store.errors import DatabaseMovedError, StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, trial
 

@@ -23,9 +23,9 @@ from urllib.parse import quote
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.pool import QueuePool
 
+from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
 from orchestrate.store import database_url
 from orchestrate.store.backends.base import ANNOUNCE_SECONDS, log, translated_file
-from orchestrate.store.errors import NoDatabaseError, StoreError, StoreUnavailableError
 from orchestrate.store.schema import VIEWS
 
 MOUNT_TABLE = Path("/proc/self/mountinfo")

@@ -12,10 +12,10 @@ from pathlib import Path, PurePosixPath
 import pytest
 from sqlalchemy import make_url
 
+from orchestrate.errors import StoreError
 from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store
 from orchestrate.store.backends import sqlite, sqlite_engine
 from orchestrate.store.backends.sqlite_engine import is_network, mount_of
-from orchestrate.store.errors import StoreError
 from orchestrate.store.maintenance import upgrade, vacuum
 from orchestrate.store.merge import merge
 from orchestrate.store.store import make_backend
