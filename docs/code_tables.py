@@ -20,7 +20,7 @@ from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
 from dopt.explorer.signs import STORED
-from dopt.fitting.stored import FIT_MEASURES
+from dopt.fitting.export import FIT_MEASURES
 from dopt.kernel import plugin
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System

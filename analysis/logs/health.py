@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dopt.log import Log, Piece
-from dopt.log_columns import TURN
+from dopt.log import TURN, Log, Piece
 from dopt.types import Array, Booleans, Vector
 
 LAGS = np.arange(-3, 9)

@@ -14,8 +14,7 @@ import pandas as pd
 from analysis.logs.health import FEW, MOST_ROWS, Effect, Health, Signal, examine
 from analysis.logs.tables import is_flag, log_of, read_table
 from analysis.style import number
-from dopt.log import Log
-from dopt.log_columns import TURN
+from dopt.log import TURN, Log
 from orchestrate.program import UsageError, path, positive, tell
 
 HELP = "how healthy a recorded run is: sampling, noise, limits, delay, feedback, units"

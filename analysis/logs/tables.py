@@ -13,8 +13,7 @@ import pandas as pd
 
 from analysis.errors import AnalysisError
 from dopt.errors import given_path, install_command
-from dopt.log import Log
-from dopt.log_columns import CLOCKS
+from dopt.log import CLOCKS, Log
 
 INPUTS = re.compile(
     r"^u\d*$|input|volt|torque|^tau|current|pwm|force|throttle|command|(^|_)cmd($|_|\d)",

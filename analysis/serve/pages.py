@@ -481,7 +481,7 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
 
 
 AHEAD = ("rms", "median", "physics", "linear", "unchanged")
-"""Errors of a fit's predictions (:data:`dopt.fitting.stored.FIT_MEASURES`)."""
+"""Errors of a fit's predictions (:data:`dopt.fitting.export.FIT_MEASURES`)."""
 
 
 def _fit(reader: Reader, trial: Content, config: Content) -> Content | None:

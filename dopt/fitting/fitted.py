@@ -347,7 +347,7 @@ class Fitted:
     def store(self, url: str | None = None) -> str:
         """Store the fit as a trial in the results database of the launches.
 
-        Its steps are the rows of the logs, its numbers assessments (:mod:`dopt.fitting.stored`).
+        Its steps are the rows of the logs, its numbers assessments (:mod:`dopt.fitting.export`).
         What is stored of the same fit already is replaced.
 
         Parameters
@@ -368,7 +368,7 @@ class Fitted:
             If the package orchestrate is not installed.
         """
         from dopt.explorer.saving import new_saver
-        from dopt.fitting.stored import FittedTrial
+        from dopt.fitting.export import FittedTrial
 
         trial, saver = FittedTrial(self), new_saver(url)
         try:
