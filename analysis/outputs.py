@@ -50,9 +50,6 @@ _PLOTS = {
     "figure4_width_loss": ("width", "LOSS_AGAINST_WIDTH"),
     "figure5_control": ("control", "CONTROL"),
     "figure6_pareto": ("pareto", "PARETO"),
-    "figure7_profiles": ("profiles", "PROFILES"),
-    "figure8_sensitivity": ("sensitivity", "SENSITIVITY"),
-    "figure9_limits": ("limits", "LIMITS"),
 }
 """Module, name and subject of each figure, in the order of the page."""
 

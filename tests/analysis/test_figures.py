@@ -1,4 +1,4 @@
-"""Numbers and drawings of figures 4, 6, 7 and 8."""
+"""Numbers and drawings of figures 4 and 6, and ratios over all systems."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from analysis.data.matching import Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.figures import pareto as figure6
-from analysis.figures import profiles as figure7
-from analysis.figures import sensitivity as figure8
 from analysis.figures.pareto import (
     PARETO,
     Point,
@@ -24,17 +22,6 @@ from analysis.figures.pareto import (
     pareto_part,
     policies_of,
     policy_colours,
-)
-from analysis.figures.profiles import (
-    measure_profiles,
-    profiles_part,
-    tabulate_profiles,
-)
-from analysis.figures.sensitivity import (
-    SENSITIVITY,
-    Line,
-    measure_lines,
-    sensitivity_part,
 )
 from analysis.figures.width import (
     exponent,
@@ -54,45 +41,6 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, wide
 from tests.analysis.synthetic import fill, make_grid
-
-
-def test_a_profile_counts_runs_and_rises_to_those_that_did_not_diverge(reader: Reader) -> None:
-    selection = select(reader, Filter())
-    profiles = {one.label: one for one in measure_profiles(profiles_part(selection))}
-    random = profiles["random"]
-    assert random.environments == ("pendulum", "cartpole", "quadrotor")
-    assert (random.n, random.n_diverged) == (15, 1)
-    assert (np.diff(random.share.centre) >= 0).all()
-    assert random.share.centre[-1] == pytest.approx((1 + 0.8 + 1) / 3)
-    assert profiles["D-optimal"].share.centre[-1] == 1.0
-    assert profiles["periodic"].environments == ("pendulum", "cartpole")
-
-
-def test_a_point_of_a_profile_by_hand(reader: Reader) -> None:
-    selection = select(reader, Filter(("pendulum",), ("d_optimal", "random")))
-    own, reference = (
-        np.array(list(entry.final_losses().values()))
-        for entry in sorted(selection.entries, key=lambda one: one.config.policy != "random")
-    )
-    [profile] = [one for one in measure_profiles(selection) if one.label == "random"]
-    place = 150
-    limit = profile.factors[place] * np.exp(np.mean(np.log(reference)))
-    assert profile.share.centre[place] == np.mean(own <= limit)
-
-
-def test_the_caption_says_what_is_in_fewer_environments(reader: Reader) -> None:
-    profiles = measure_profiles(profiles_part(select(reader, Filter())))
-    words = figure7.caption(profiles)
-    assert "In fewer environments: periodic: pendulum, cartpole" in words
-    assert "random: 15, 1 diverged" in words
-    [legend] = figure7.draw(profiles).legends
-    assert "periodic (2 of 3 systems)" in [text.get_text() for text in legend.get_texts()]
-    assert len(tabulate_profiles(profiles)) == 301 * 4  # all but the oracle
-
-
-def test_one_policy_has_no_profile(reader: Reader) -> None:
-    alone = select(reader, Filter(policies=("d_optimal",)))
-    assert profiles_part(alone).entries == ()
 
 
 def test_the_ratio_over_systems_is_the_geometric_mean_of_theirs(
@@ -118,85 +66,6 @@ def test_the_table_says_which_systems_a_row_is_of(
     assert "14, 1 diverged" in printed
     assert main(["aggregate", "--db", url, "--policy", "random"]) == 2
     assert "needs trials of the reference d_optimal" in capsys.readouterr().err
-
-
-RATES = (1e-3, 1e-2, 1e-1)
-RIDGES = (1e-4, 1e-3, 1e-2)
-
-
-@pytest.fixture(scope="module")
-def varied(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return two policies in two systems under three learning rates and three λ, one diverged."""
-    address = f"sqlite:///{tmp_path_factory.mktemp('sensitivity')}/results.db"
-    envs, both, seeds = ("pendulum", "arm"), ("d_optimal", "random"), range(3)
-    specs = [
-        spec
-        for rate in RATES
-        for spec in make_grid(envs, both, seeds, learner={"learning_rate": rate}, **SHORT)
-    ]
-    for ridge in RIDGES:
-        specs += make_grid(envs, both[:1], seeds, policy={"regularization": ridge}, **SHORT)
-    two = {"learning_rate": 0.1}, {"regularization": 0.01}  # differ in both: part of no line
-    specs += make_grid(envs, both[:1], seeds, learner=two[0], policy=two[1], **SHORT)
-    specs += make_grid(envs, ("uniform",), seeds, **SHORT)  # has no line
-    specs = list({spec.trial_key: spec for spec in specs}.values())
-    lost = [s for s in specs if s.policy.name == "random" and s.system.name == "arm"]
-    slow = [s for s in lost if s.to_mapping()["learner"]["learning_rate"] == 1e-3 and s.seed == 0]
-    fill(address, specs, diverged={slow[0].trial_key: 20})
-    return address
-
-
-def measured(url: str) -> tuple[Line, ...]:
-    with Reader.open(url) as reader:
-        part = sensitivity_part(select(reader, Filter()))
-        return measure_lines(reader, part, DivergenceRule.EXCLUDE)
-
-
-def test_a_line_varies_one_setting_and_others_have_a_level(varied: str) -> None:
-    lines = {(one.env, one.policy, one.setting): one for one in measured(varied)}
-    assert len(lines) == 2 * 2 * 2
-    rates = lines["arm", "random", "learner.learning_rate"]
-    assert (rates.values, rates.usual) == (RATES, 1e-2)
-    ridges = lines["pendulum", "d_optimal", "policy.regularization"]
-    assert (ridges.values, ridges.usual) == (RIDGES, 1e-3)
-    level = lines["pendulum", "random", "policy.regularization"]
-    assert level.values == ()
-    assert level.losses == (lines["pendulum", "random", "learner.learning_rate"].losses[1],)
-
-
-def test_losses_are_geometric_means_and_diverged_trials_are_counted(varied: str) -> None:
-    [line] = [
-        one
-        for one in measured(varied)
-        if (one.env, one.policy, one.setting) == ("arm", "random", "learner.learning_rate")
-    ]
-    assert [one.describe() for one in line.scores] == ["2/3, 1 diverged", "3", "3"]
-    for loss, scores in zip(line.losses, line.scores, strict=True):
-        assert loss.value == pytest.approx(np.exp(np.log(scores.values).mean()))
-    assert "random, learning_rate=0.001: 2/3, 1 diverged" in figure8.caption((line,))
-
-
-def test_it_has_a_row_for_each_system_and_a_column_for_each_setting(varied: str) -> None:
-    lines = measured(varied)
-    figure = figure8.draw(lines)
-    assert len(figure.axes) == 2 * 2
-    labels = [axes.get_xlabel() for axes in figure.axes[2:]]
-    assert labels == ["λ of the information matrix", "learning rate"]
-    assert "Level: random" in figure8.caption(lines)
-
-
-def test_two_values_are_too_few(reader: Reader, tmp_path: Path) -> None:
-    address = f"sqlite:///{tmp_path}/few.db"
-    for rate in RATES[:2]:
-        learner = {"learning_rate": rate}
-        fill(address, make_grid(("arm",), ("random",), range(2), learner=learner, **SHORT))
-    with Reader.open(address) as few:
-        assert sensitivity_part(select(few, Filter())).entries == ()
-    plot = SENSITIVITY
-    part = plot.part(select(reader, Filter()), PlotOptions())
-    assert {entry.config.policy for entry in part.entries} == {"random"}
-    table = plot.make(reader, part, PlotOptions()).table
-    assert table["value"].tolist() == [10.0, 20.0, 40.0, 60.0, 100.0]
 
 
 def reader_of(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Reader:
