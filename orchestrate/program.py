@@ -50,8 +50,10 @@ SUCCESSORS = {
     "launch.reference": "compare with python -m analysis compare --reference POLICY",
     "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
     "launch.until='ci<5%'",
-    "export mlflow": "export a bundle, and run studies/trackers/mlflow_runs.py",
-    "export wandb": "export a bundle, and run studies/trackers/wandb_runs.py",
+    "export mlflow": "run studies/trackers/mlflow_runs.py on a SQLite file",
+    "export wandb": "run studies/trackers/wandb_runs.py on a SQLite file",
+    "export bundle": "copy trials into a file with python -m orchestrate merge OTHER --db "
+    "sqlite:///FILE, or export trials, curves, trajectories and assessments as Parquet",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",

@@ -60,10 +60,9 @@ ORCHESTRATE_IMPORTS = {
     "config": BASE,
     "executors": BASE | {"config", "fingerprint"},
     "store": {"errors", "records", "files"},
-    "queries": BASE | {"store"},
     "runner": BASE | {"config", "executors", "fingerprint", "store"},
-    "export": BASE | {"queries", "store"},
-    "commands": BASE | {"export", "queries", "runner", "store"},
+    "export": BASE | {"store"},
+    "commands": BASE | {"export", "runner", "store"},
     "launch": BASE | {"executors"},
     "__main__": BASE | {"commands"},
 }

@@ -45,7 +45,7 @@ def _add_merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "other",
         metavar="OTHER",
-        help="file or URL of the other database, or folder of a bundle or of shards",
+        help="file or URL of the other database, or folder of shards",
     )
 
 
@@ -64,10 +64,6 @@ def _merge(url: str, other: str) -> Merged:
     place = given_path(other, "OTHER", UsageError)
     if not place.is_dir():
         return merge(url, f"sqlite:///{place.absolute()}", trial_key)
-    if not any(place.glob("*.db")):  # a bundle has other files
-        from orchestrate.store.bundle import merge_bundle
-
-        return merge_bundle(url, place, trial_key)
     total = Merged()
     for merged in merge_collected(url, place, trial_key=trial_key):
         total.include(merged)

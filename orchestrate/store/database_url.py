@@ -43,11 +43,10 @@ def parse(url: str) -> URL:
     names = [name for name in variables if os.environ.get(name, "").strip() == url.strip() != ""]
     where = f" in the environment variable {names[0]}" if names else ""
     url = stripped(url, f"The database URL{where}", StoreError)
-    folder = url.removeprefix("bundle:///")
-    if folder != url or ("://" not in url and Path(url).is_dir()):
+    if "://" not in url and Path(url).is_dir():
         raise StoreError(
-            f"{folder} is a folder, a database is expected{where}: import a bundle with 'python "
-            f"-m orchestrate merge {shlex.quote(folder)} --db URL', and give that URL."
+            f"{url} is a folder, a database is expected{where}: merge the databases in it with "
+            f"'python -m orchestrate merge {shlex.quote(url)} --db URL', and give that URL."
         )
     try:
         parsed = make_url(url)

@@ -108,8 +108,8 @@ class OutcomeColumn(NamedTuple):
 class Outcome:
     """Columns of a trial that its outcome fills; None before.
 
-    The table of trials and the views, what a launch writes, the rows of a reader, exports and
-    bundles are made from these fields, by their names: a column is added here, with statements
+    The table of trials and the views, what a launch writes, the rows of a reader and exports
+    are made from these fields, by their names: a column is added here, with statements
     in :data:`orchestrate.store.maintenance.STATEMENTS`.
     """
 

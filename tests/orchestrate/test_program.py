@@ -28,7 +28,7 @@ from orchestrate.errors import (
     without_password,
     without_password_in_word,
 )
-from orchestrate.files import OutputError, make_folder, whole, whole_folder, writing
+from orchestrate.files import OutputError, make_folder, whole, writing
 from orchestrate.program import as_started
 from orchestrate.runner.saving import launch_record
 from orchestrate.store import StoreUnavailableError
@@ -390,12 +390,6 @@ def test_a_torn_file_is_removed_and_the_cause_named(tmp_path: Path) -> None:
     with whole(target) as part:
         part.write_text("all")
     assert [path.name for path in target.parent.iterdir()] == ["table.csv"]
-
-
-def test_a_folder_is_whole_too(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="No space left"), whole_folder(tmp_path / "x", bool):
-        raise full()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_error_of_a_library_that_a_full_disk_caused_is_recognised(tmp_path: Path) -> None:

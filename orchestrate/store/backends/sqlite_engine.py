@@ -281,21 +281,6 @@ def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience
     return _engine(connect, begin)
 
 
-def filling_engine(path: Path) -> Engine:
-    """Return an engine for a new file that no other process reads, without a log and without syncs.
-
-    A file that is not complete after a crash must be deleted.
-    """
-
-    def connect() -> sqlite3.Connection:
-        connection = _connect(_address(path, "mode=rwc"))
-        connection.execute("PRAGMA journal_mode = OFF")
-        connection.execute("PRAGMA synchronous = OFF")
-        return connection
-
-    return _engine(connect, _begin)
-
-
 def _begin(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN")
 
