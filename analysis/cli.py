@@ -17,12 +17,10 @@ from typing import Any
 
 import pandas as pd
 
-from analysis import fit_report, report
-from analysis.data.matching import REFERENCE, Filter, read_condition
+from analysis import log_report, report
+from analysis.data.matching import REFERENCE, AnalysisError, Filter, IncompleteError, read_condition
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError, IncompleteError
-from analysis.logs import report as log_report
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread
@@ -159,9 +157,9 @@ def parser() -> Parser:
     recorded = commands.add_parser("log", help=log_report.HELP, description=log_report.HELP)
     log_report.add_arguments(recorded)
     recorded.set_defaults(alone=log_report.run)
-    fitted = commands.add_parser("fit", help=fit_report.HELP, description=fit_report.HELP)
-    fit_report.add_arguments(fitted)
-    fitted.set_defaults(alone=fit_report.run)
+    fitted = commands.add_parser("fit", help=log_report.FIT_HELP, description=log_report.FIT_HELP)
+    log_report.add_fit_arguments(fitted)
+    fitted.set_defaults(alone=log_report.run_fit)
     _add_serve(commands)
     return top
 

@@ -21,9 +21,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from analysis.data.matching import AnalysisError
 from analysis.data.samples import simulated_trial
 from analysis.data.selection import Entry
-from analysis.errors import AnalysisError
 from analysis.figures.loss_curves import loss_label
 from analysis.figures.panels import angle_ticks, log_ticks, mathematical, styled
 from analysis.stats.curves import DrawnPlane, log_limits

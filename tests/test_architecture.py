@@ -25,7 +25,7 @@ SAVES = {"orchestrate.runner.saving"}
 
 ONLY_IN = {
     "hydra": ("orchestrate/config/",),
-    "omegaconf": ("orchestrate/config/", "analysis/fit_report.py"),
+    "omegaconf": ("orchestrate/config/", "analysis/log_report.py"),
     "ray": ("orchestrate/executors/ray/",),
     "sqlalchemy": ("orchestrate/store/",),
     "psycopg": ("orchestrate/store/",),

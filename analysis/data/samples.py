@@ -23,9 +23,15 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import Filter, check_names, choose, latest, read_condition
+from analysis.data.matching import (
+    AnalysisError,
+    Filter,
+    check_names,
+    choose,
+    latest,
+    read_condition,
+)
 from analysis.data.selection import Entry, environment_rank, policy_rank
-from analysis.errors import AnalysisError
 from analysis.style import of_finished
 from dopt.assessment import SAMPLE_LOSS, Plane
 from dopt.limits import VIOLATIONS, limits_from

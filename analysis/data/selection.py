@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from analysis.data.matching import (
     REFERENCE,
+    AnalysisError,
     Filter,
     check_keys,
     check_names,
@@ -21,7 +22,6 @@ from analysis.data.matching import (
     setting_value,
     source_notes,
 )
-from analysis.errors import AnalysisError
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES, TITLES
 from dopt.spec.label import labels, limits_label, value_label

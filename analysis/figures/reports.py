@@ -22,7 +22,7 @@ from analysis.figures.panels import (
     sheet,
     styled,
 )
-from analysis.logs.health import LAGS, Health, Signal
+from analysis.log_health import LAGS, Health, Signal
 from analysis.style import BLUE, GREY, SEQUENCE, VERMILLION
 from analysis.tables.rendering import records
 from analysis.tables.variants import verdict

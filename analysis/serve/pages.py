@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import latest
+from analysis.data.matching import AnalysisError, latest
 from analysis.data.samples import DivergenceRule, bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
-from analysis.errors import AnalysisError
 from analysis.serve.web import NotFoundError, QueryParams, ServerState, read_progress, truncated
 from analysis.stats.curves import (
     Axis,

@@ -24,9 +24,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response, StreamingResponse
 
-from analysis.data.matching import Filter, read_condition
+from analysis.data.matching import AnalysisError, Filter, read_condition
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError
 from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader

@@ -18,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import nearness
+from analysis.data.matching import AnalysisError, nearness
 from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
-from analysis.errors import AnalysisError
 from analysis.stats.intervals import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,

@@ -13,9 +13,9 @@ import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
+from analysis.data.matching import AnalysisError, IncompleteError
 from analysis.data.samples import learned_model, sample_losses, simulated_trial
 from analysis.data.selection import Entry, Gap, Selection
-from analysis.errors import AnalysisError, IncompleteError
 from analysis.stats.curves import PlotOptions
 from analysis.stats.intervals import STUDENT_RANGE
 from analysis.stats.scores import Measure, control_part, geometric_mean

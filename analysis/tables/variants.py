@@ -17,7 +17,14 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import Filter, difference, latest_sources, nearness, newest
+from analysis.data.matching import (
+    AnalysisError,
+    Filter,
+    difference,
+    latest_sources,
+    nearness,
+    newest,
+)
 from analysis.data.samples import DivergenceRule, coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
@@ -29,7 +36,6 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.errors import AnalysisError
 from analysis.stats.intervals import mean_columns
 from analysis.stats.scores import (
     TrueModel,

@@ -13,16 +13,19 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model, data_of, measured_names
-from dopt.fitting.predictions import (
+from dopt.fitting.problem import (
     HORIZONS,
     Predicted,
+    Simulator,
+    Solution,
+    Windows,
     errors_ahead,
+    first_states,
     horizon_errors,
     linear_predictions,
     predicted,
     prediction_rows,
 )
-from dopt.fitting.problem import Simulator, Solution, Windows, first_states
 from dopt.fitting.simulation import Data
 from dopt.log import Log
 from dopt.systems.plant import Plant, Unknown

@@ -23,9 +23,9 @@ from orchestrate.config.options import check_launch
 from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.registry import executor_factory, make_job
 from orchestrate.program import ROOT, answered, say, tell
-from orchestrate.runner.chunks import check_memory
 from orchestrate.runner.run_grid import WORK, Work, launch_grid
 from orchestrate.runner.saving import launch_record
+from orchestrate.runner.scheduler import check_memory
 from orchestrate.store import (
     FINISHED,
     RETRIED,

@@ -23,8 +23,7 @@ from orchestrate.errors import NoDatabaseError, StoreError
 from orchestrate.files import whole
 from orchestrate.store import database_url, launches, records, schema
 from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.backups import copy_checked, dump
-from orchestrate.store.backends.base import Backend, translated, translated_file
+from orchestrate.store.backends.base import Backend, copy_checked, dump, translated, translated_file
 from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.launches import refuse_living

@@ -15,10 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from analysis.cli import main
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import select
-from analysis.errors import AnalysisError
-from analysis.figures.input_spectrum import GREYS
 from analysis.figures.panels import (
     COLUMN_WIDTH,
     angle_text,
@@ -29,7 +27,7 @@ from analysis.figures.panels import (
     rows_and_columns,
     styled,
 )
-from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
+from analysis.figures.phase_portraits import GREYS, measure_portraits, tabulate_portraits
 from analysis.stats.curves import axis_parts, band_limits, log_limits, median_seed
 from analysis.stats.intervals import Band
 from analysis.style import SEQUENCE, policy_style, sequence_style

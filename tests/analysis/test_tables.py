@@ -17,12 +17,11 @@ from hypothesis.extra.numpy import arrays
 
 import analysis
 from analysis.cli import main
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError
-from analysis.figures.control import caption_control, draw_control
-from analysis.figures.input_spectrum import caption, measure_spectra, tabulate_spectra
+from analysis.figures.loss_curves import caption_control, draw_control
+from analysis.figures.phase_portraits import measure_spectra, spectrum_caption, tabulate_spectra
 from analysis.outputs import build
 from analysis.report import CAPTION, EXPLAINED
 from analysis.stats.curves import (
@@ -632,7 +631,7 @@ def test_a_policy_of_which_every_trial_diverged_is_named(tmp_path: Path) -> None
         spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
     assert [one.policy for one in spectra.policies] == ["d_optimal"]
     assert spectra.diverged == ("random",)
-    assert "Not drawn, because every trial diverged: random." in caption(spectra)
+    assert "Not drawn, because every trial diverged: random." in spectrum_caption(spectra)
 
 
 def test_unit_of() -> None:

@@ -33,8 +33,15 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from dopt.errors import install_command
 from orchestrate.errors import StoreError, StoreUnavailableError
 from orchestrate.store import database_url
-from orchestrate.store.backends.backups import back_up_to, dump
-from orchestrate.store.backends.base import ANNOUNCE_SECONDS, Backend, LaunchLife, NewTrial, log
+from orchestrate.store.backends.base import (
+    ANNOUNCE_SECONDS,
+    Backend,
+    LaunchLife,
+    NewTrial,
+    back_up_to,
+    dump,
+    log,
+)
 from orchestrate.store.records import Array, finite_list
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
 

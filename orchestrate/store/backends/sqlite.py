@@ -17,8 +17,15 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from orchestrate.errors import DatabaseMovedError, StoreError, StoreUnavailableError
 from orchestrate.store import database_url
-from orchestrate.store.backends.backups import back_up_to, copy_checked, rescue
-from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial, translated_file
+from orchestrate.store.backends.base import (
+    Backend,
+    LaunchLife,
+    NewTrial,
+    back_up_to,
+    copy_checked,
+    rescue,
+    translated_file,
+)
 from orchestrate.store.backends.sqlite_engine import (
     LaunchLocks,
     driver_of,

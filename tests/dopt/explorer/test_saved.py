@@ -21,9 +21,8 @@ from starlette.testclient import TestClient
 import analysis
 import analysis.cli
 import dopt
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import select
-from analysis.errors import AnalysisError
 from analysis.serve.app import create_app
 from analysis.tables.comparisons import compare_policies
 from dopt import Explorer, TrialSpec

@@ -279,7 +279,7 @@ def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.Mon
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orchestrate.store.backends.backups.os.fsync", full)
+    monkeypatch.setattr("orchestrate.store.backends.base.os.fsync", full)
     with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
         upgrade(sqlite_url)
     assert structure(sqlite_url) == before
