@@ -128,11 +128,8 @@ smoke: run  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
 	$(BIN)/python -m analysis figures --db '$(SMOKE_DB)' --out figures/smoke
 
-bench: run  ## print measured speed beside its targets, and draw cost against width
+bench: run  ## print measured speed beside its targets
 	$(BIN)/python -m benchmarks
-	$(BIN)/python orchestrate/launch.py -m experiment=width executor=local store.url='$(DB)'
-	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width
-	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width_loss
 
 bench-check: run  ## fail where a step, a trial or the expansion of a grid has become slower
 	$(BIN)/python -m benchmarks --quick --only $(CHECKED) --against benchmarks/history.jsonl

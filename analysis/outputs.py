@@ -46,8 +46,6 @@ _PLOTS = {
     "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
     "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
     "figure2_spectrum": ("phase_portraits", "spectrum_plot", "cartpole"),
-    "figure4_width": ("width", "COST"),
-    "figure4_width_loss": ("width", "LOSS_AGAINST_WIDTH"),
     "figure5_control": ("loss_curves", "CONTROL"),
     "figure6_pareto": ("pareto", "PARETO"),
 }

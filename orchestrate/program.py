@@ -41,6 +41,8 @@ _INSTALLED = {
 
 SUCCESSORS = {
     "analysis --figures": "open README.md in the folder of figures",
+    "figure4_width": "python -m studies.speed.width prints the cost of a step",
+    "figure4_width_loss": "python -m analysis summary --group-by width shows the losses",
     "figure7_profiles": "python -m analysis aggregate compares over all systems",
     "figure8_sensitivity": "python -m analysis summary --group-by learner.window shows each value",
     "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",
@@ -52,6 +54,7 @@ SUCCESSORS = {
     "launch.until='ci<5%'",
     "export mlflow": "run studies/trackers/mlflow_runs.py on a SQLite file",
     "export wandb": "run studies/trackers/wandb_runs.py on a SQLite file",
+    "export npz": "analysis.load() gives matrices and trajectories in Python, for numpy.savez",
     "export bundle": "copy trials into a file with python -m orchestrate merge OTHER --db "
     "sqlite:///FILE, or export trials, curves, trajectories and assessments as Parquet",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
