@@ -1,14 +1,8 @@
-"""Results as tables and as named matrices: rows of the database, and their files.
-
-One Arrow batch at a time is in memory, or the arrays of one configuration.
-"""
+"""Results as tables: rows of the database, and their files; one Arrow batch at a time."""
 
 from __future__ import annotations
 
-import zipfile
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +14,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from orchestrate.store import ConfigRow, Reader, Trajectory
-from orchestrate.store.records import stacked, unpack
+from orchestrate.store.records import unpack
 from orchestrate.store.schema import OUTCOME_COLUMNS, trial
 
 _TEXT, _WHOLE, _REAL = pa.string(), pa.int64(), pa.float64()
@@ -97,11 +91,6 @@ _ASSESSMENTS = """
 SELECT seed, status, t, measure, value FROM v_assessment
 WHERE config_key = :config_key AND status IN ('done', 'diverged') ORDER BY seed, t, measure
 """
-
-Named = tuple[str, npt.NDArray[Any], tuple[str, ...]]
-"""Name, array and the names of its axes."""
-
-_AT_A_TIME = 100  # trajectories
 
 
 def trajectory_columns(n_states: int, n_inputs: int) -> pa.Schema:
@@ -258,117 +247,10 @@ def gathered(batches: Iterable[pa.RecordBatch], least: int, of: str) -> Iterator
         yield pa.Table.from_batches(waiting)
 
 
-def names(configs: Sequence[ConfigRow]) -> list[str]:
-    """Return env/policy/width of each configuration, and the key where that is not unique."""
-    short = [f"{c.env}/{c.policy}/{'-' if c.width is None else c.width}" for c in configs]
-    count = Counter(short)
-    return [
-        f"{name}/{config.config_key[:KEY_DIGITS]}" if count[name] > 1 else name
-        for name, config in zip(short, configs, strict=True)
-    ]
-
-
-def _curves_in_arrays(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
-    """Yield the curves of the finished trials, (seed, t), NaN from a divergence or an end on."""
-    for name, config in zip(names(configs), configs, strict=True):
-        seeds, diverged, steps = _stacked_steps(reader, config)
-        for column, values in zip(STEP_COLUMNS, steps, strict=True):
-            yield f"{name}/{column}", values, ("seed", "t")
-        yield f"{name}/seed", seeds, ("seed",)
-        yield f"{name}/diverged", diverged, ("seed",)
-
-
-def _stacked_steps(
-    reader: Reader, config: ConfigRow
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
-    """Return seeds (n,), flags of divergence (n,) and the columns of the steps (5, n, T)."""
-    found: dict[int, bool] = {}
-    lengths: Counter[int] = Counter()
-    blocks = [np.empty((0, len(STEP_COLUMNS)))]
-    with closing(steps(reader, config)) as batches:
-        for rows in batches:
-            seeds, statuses, _t, *values = zip(*rows, strict=True)
-            found.update(zip(seeds, (status == "diverged" for status in statuses), strict=True))
-            lengths.update(seeds)
-            blocks.append(np.array(values, dtype=np.float64).T)
-    ends = np.cumsum([lengths[seed] for seed in found])[:-1]
-    split = np.split(np.concatenate(blocks), ends)
-    values_of = stacked(split) if found else np.empty((0, config.horizon, len(STEP_COLUMNS)))
-    return (
-        np.array([*found], np.int64),
-        np.array([*found.values()], np.bool_),
-        values_of.T.swapaxes(1, 2),
-    )
-
-
-def _trajectories_in_arrays(
-    reader: Reader, configs: Sequence[ConfigRow]
-) -> Generator[Named, None, None]:
-    """Yield states, inputs and final parameters of the finished trials."""
-    for name, config in zip(names(configs), configs, strict=True):
-        found = list(of_config(reader, config, _AT_A_TIME))
-        if found:
-            yield f"{name}/states", stacked([one.states for *_, one in found]), _axes("state")
-            yield f"{name}/inputs", stacked([one.inputs for *_, one in found]), _axes("input")
-            parameters = np.stack([one.parameters for *_, one in found])
-            yield f"{name}/parameters", parameters, ("seed", "parameter")
-        yield f"{name}/seed", np.array([seed for seed, *_ in found], dtype=np.int64), ("seed",)
-        diverged = [status == "diverged" for _, status, _ in found]
-        yield f"{name}/diverged", np.array(diverged, dtype=np.bool_), ("seed",)
-
-
-def _assessments_in_arrays(
-    reader: Reader, configs: Sequence[ConfigRow]
-) -> Generator[Named, None, None]:
-    """Yield each measure of the finished trials, (seed, t), with its seeds and numbers of steps."""
-    for name, config in zip(names(configs), configs, strict=True):
-        for measure in reader.measures(config.config_key):
-            found = reader.assessments(config.config_key, measure)
-            yield f"{name}/{measure}", found.values, ("seed", "t")
-            yield f"{name}/{measure}/seed", found.seeds, ("seed",)
-            yield f"{name}/{measure}/t", found.t, ("t",)
-
-
-def _trials_in_arrays(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
-    """Yield the columns of the table of trials; a missing number is NaN, a missing text empty."""
-    table = trials(reader, configs)
-    batches = list(table.batches)
-    for i, field in enumerate(TRIALS):
-        values = [value for batch in batches for value in batch.column(i).to_pylist()]
-        if str(field.type) == "string":
-            array = np.array([value or "" for value in values], dtype=np.str_)
-        elif None in values or str(field.type) == "double":
-            array = np.array(values, dtype=np.float64)
-        else:
-            array = np.array(values, dtype=np.int64)
-        yield field.name, array, ("trial",)
-
-
-def write_npz(path: Path, arrays: Iterator[Named]) -> dict[str, dict[str, Any]]:
-    """Write the arrays one by one; return the axes and the shape of each."""
-    written: dict[str, dict[str, Any]] = {}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array, axes in arrays:
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
-            written[name] = {"axes": axes, "shape": array.shape, "dtype": str(array.dtype)}
-    return written
-
-
-def _axes(last: str) -> tuple[str, str, str]:
-    return ("seed", "t", last)
-
-
 STREAMS: dict[str, Callable[[Reader, Sequence[ConfigRow]], Stream]] = {
     "curves": curves,
     "trials": trials,
     "trajectories": trajectories,
     "assessments": assessments,
-}
-MATRICES: dict[str, Callable[[Reader, Sequence[ConfigRow]], Generator[Named, None, None]]] = {
-    "curves": _curves_in_arrays,
-    "trials": _trials_in_arrays,
-    "trajectories": _trajectories_in_arrays,
-    "assessments": _assessments_in_arrays,
 }
 WRITERS = {"csv": write_csv, "parquet": write_parquet}

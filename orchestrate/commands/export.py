@@ -17,14 +17,14 @@ from orchestrate.commands.command import Command, add_filters, answer, chosen
 from orchestrate.commands.results import counts
 from orchestrate.errors import ExitCode, without_password
 from orchestrate.files import whole
-from orchestrate.program import UsageError, path
+from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store.records import now
 
 KINDS = ("curves", "trials", "trajectories", "assessments")
 """Exports that are one file."""
 
-FORMATS = ("csv", "parquet", "npz")
+FORMATS = ("csv", "parquet")
 
 _WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id IS NOT NULL"
 
@@ -79,13 +79,9 @@ def _write(
 ) -> dict[str, Any]:
     from orchestrate import export as tables  # Arrow: other commands do without it
 
-    # After an error the cursors must close before the database does.
-    if wanted.format == "npz":
-        with closing(tables.MATRICES[wanted.kind](reader, configs)) as arrays:
-            return {"arrays": tables.write_npz(out, arrays)}
     stream = tables.STREAMS[wanted.kind](reader, configs)
     columns = {field.name: str(field.type) for field in stream.schema}
-    with closing(stream.batches):
+    with closing(stream.batches):  # after an error, before the database
         return {"rows": tables.WRITERS[wanted.format](out, stream), "columns": columns}
 
 
@@ -120,7 +116,7 @@ def provenance(
         "schema_version": reader.schema_version(),
         "filters": {name: list(values) for name, values in filters.items()},
         "trials": dict(counts(configs)),
-        "missing_values": "empty in csv, null in parquet, NaN in npz: a loss that is not finite",
+        "missing_values": "empty in csv, null in parquet: a loss that is not finite",
         "configs": {config.config_key: dict(config.config) for config in configs},
         "launches": [_public(launch) for launch in launches],
     }
@@ -136,12 +132,12 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
         "kind",
         choices=KINDS,
         help="curves (a row for each step), trials (a row for each trial), trajectories (states "
-        "and inputs; with npz also the final parameters) or assessments",
+        "and inputs) or assessments",
     )
     parser.add_argument("path", nargs="?", type=path("PATH"), metavar="PATH", help="file to write")
     parser.add_argument("--out", type=path("--out"), metavar="PATH", help="the same, as an option")
     parser.add_argument(
-        "--format", choices=FORMATS, help="csv, parquet or npz (as the name of the file ends)"
+        "--format", choices=FORMATS, help="csv or parquet (as the name of the file ends)"
     )
     add_filters(parser)
 
@@ -176,6 +172,7 @@ def _target(arguments: argparse.Namespace) -> Path:
 def _format_of(path: Path) -> str:
     ending = path.suffix.removeprefix(".").lower()
     if ending not in FORMATS:
+        check_removed(f"export {ending}")
         raise UsageError(
             f"The name of {path} does not say its format, {', '.join(FORMATS)} are known: give "
             f"--format or such an ending."

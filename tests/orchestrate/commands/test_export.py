@@ -27,7 +27,6 @@ from tests.orchestrate.commands.conftest import (
 )
 from tests.orchestrate.store.fakes import (
     HORIZON,
-    LAUNCH,
     Spec,
     assessed,
     diverged,
@@ -36,7 +35,7 @@ from tests.orchestrate.store.fakes import (
 from tests.paths import ROOT, without_coverage
 
 Run = Callable[..., Answer]
-FORMATS = ("csv", "parquet", "npz")
+FORMATS = ("csv", "parquet")
 NO_ROOM = """
 import resource, sys
 sys.dont_write_bytecode = True  # a file that is cut would stay
@@ -122,67 +121,11 @@ class TestTables:
             assert [*frame.t] == [row.t for row in expected]
             assert [*frame.value][:-1] == [row.value for row in expected][:-1]
             assert np.isnan([*frame.value][-1])
-        out = tmp_path / "assessments.npz"
-        assert command("export", "assessments", "--out", str(out)).code == 0
-        with np.load(out) as arrays:
-            costs = [row.value for row in expected if row.measure == "cost"]
-            (name,) = (name for name in arrays if name.endswith("/cost"))
-            np.testing.assert_array_equal(arrays[name], [costs])
-            np.testing.assert_array_equal(arrays[f"{name}/t"], [0, 3, 7])
 
     def test_null_is_null_in_parquet(self, command: Run, tmp_path: Path) -> None:
         out = tmp_path / "curves.parquet"
         command("export", "curves", "--out", str(out))
         assert pyarrow.parquet.read_table(out)["loss"].null_count == HORIZON - 3
-
-
-@pytest.mark.usefixtures("grid")
-class TestMatrices:
-    def load(self, command: Run, kind: str, out: Path) -> dict[str, Any]:
-        assert command("export", kind, "--out", str(out)).code == 0
-        with np.load(out, allow_pickle=False) as arrays:
-            return dict(arrays)
-
-    def test_curves(self, command: Run, tmp_path: Path) -> None:
-        out = tmp_path / "curves.npz"
-        arrays = self.load(command, "curves", out)
-        np.testing.assert_array_equal(arrays["pendulum/random/16/seed"], [0, 1, 2])
-        for name in VALUES:
-            expected = np.stack([getattr(RESULTS[spec], name) for spec in DONE])
-            np.testing.assert_array_equal(arrays[f"pendulum/random/16/{name}"], expected)
-        np.testing.assert_array_equal(arrays["pendulum/d_optimal/16/diverged"], [True])
-        loss = arrays["pendulum/d_optimal/16/loss"]
-        np.testing.assert_array_equal(loss, [diverged(3, seed=BAD.seed).loss])
-        assert arrays["cartpole/random/-/loss"].shape == (0, HORIZON)
-        described = manifest(out)["arrays"]
-        assert described.keys() == arrays.keys()
-        axes = described["pendulum/random/16/loss"]
-        assert axes == {"axes": ["seed", "t"], "shape": [3, HORIZON], "dtype": "float64"}
-
-    @on_both
-    def test_trajectories(self, command: Run, tmp_path: Path) -> None:
-        arrays = self.load(command, "trajectories", tmp_path / "trajectories.npz")
-        for name in ("states", "inputs", "parameters"):
-            expected = np.stack([getattr(RESULTS[spec], name) for spec in DONE])
-            np.testing.assert_array_equal(arrays[f"pendulum/random/16/{name}"], expected)
-        assert "cartpole/random/8/states" not in arrays
-
-    def test_trials(self, command: Run, tmp_path: Path) -> None:
-        arrays = self.load(command, "trials", tmp_path / "trials.npz")
-        assert {array.shape for array in arrays.values()} == {(9,)}
-        assert arrays["seed"].dtype == np.int64
-        (place,) = np.flatnonzero(arrays["trial_key"] == DONE[1].trial_key)
-        assert arrays["final_loss"][place] == RESULTS[DONE[1]].final_loss
-        assert np.isnan(arrays["final_loss"][arrays["status"] == "pending"]).all()
-
-    def test_configurations_of_the_same_name_have_their_key(
-        self, store: Store, command: Run, tmp_path: Path
-    ) -> None:
-        longer = Spec(0, policy="random", horizon=9)
-        store.register(store.begin_launch(LAUNCH), [longer])
-        names = self.load(command, "curves", tmp_path / "curves.npz")
-        for spec in (longer, DONE[0]):
-            assert f"pendulum/random/16/{spec.config_key[:12]}/loss" in names
 
 
 @pytest.mark.usefixtures("grid")
@@ -209,7 +152,7 @@ class TestManifest:
         for ending in FORMATS:
             command("export", "trials", "--out", str(tmp_path / f"trials.{ending}"))
         files = [path for path in tmp_path.iterdir() if path.name.startswith("trials.")]
-        assert len(files) == 6
+        assert len(files) == 4
         for path in files:
             assert SECRET.encode() not in path.read_bytes()
 
@@ -285,6 +228,8 @@ class TestWords:
             (("curves",), "No path is given to write to"),
             (("curves", "a.csv", "--out", "b.csv"), "Two paths are given to write to"),
             (("curvse", "a.csv"), "did you mean 'curves'"),
+            (("curves", "a.npz"), "'export npz' was removed: analysis.load() gives"),
+            (("curves", "a.csv", "--format", "npz"), "'export npz' was removed"),
             (("bundle", "a"), "'export bundle' was removed: copy trials into a file with"),
         ],
     )
