@@ -63,7 +63,7 @@ ORCHESTRATE_IMPORTS = {
     "runner": BASE | {"config", "executors", "fingerprint", "store"},
     "export": BASE | {"store"},
     "commands": BASE | {"export", "runner", "store"},
-    "launch": BASE | {"executors"},
+    "launch": BASE | {"config", "executors", "runner"},
     "__main__": BASE | {"commands"},
 }
 """Folders and modules of orchestrate that each one may import."""

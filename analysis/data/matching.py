@@ -23,7 +23,7 @@ from typing import Any
 from dopt.errors import DoptError, SpecificationError
 from dopt.limits import Limits
 from dopt.registry import SOURCE, TARGET
-from dopt.spec.label import flatten
+from dopt.spec.config import flatten
 from dopt.spec.trial import TrialSpec, is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
 

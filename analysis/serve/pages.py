@@ -33,8 +33,7 @@ from analysis.style import policy_style
 from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError
 from dopt.explorer.signs import STORED
-from dopt.spec.config import completed
-from dopt.spec.label import flatten, labels
+from dopt.spec.config import completed, flatten, labels
 from dopt.spec.trial import is_fit, is_prequential, system_of
 from dopt.systems import System
 from dopt.systems.properties import eigenmode

@@ -22,7 +22,7 @@ from dopt.fitting.model import Model, data_of
 from dopt.fitting.problem import Simulator
 from dopt.fitting.simulation import Data
 from dopt.result import Assessment, TrialResult
-from dopt.spec.label import config_label
+from dopt.spec.config import config_label
 from dopt.spec.trial import FIT_MARK, MarkedTrial, marked_json
 from dopt.types import Array, Integers
 

@@ -22,8 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dopt.limits import VIOLATIONS, WORST
-from dopt.spec.config import completed
-from dopt.spec.label import limits_label
+from dopt.spec.config import completed, limits_label
 from orchestrate.commands.command import (
     Command,
     add_filters,

@@ -33,8 +33,7 @@ from dopt.types import Array
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import LaunchError
-from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
-from orchestrate.executors.registry import executor_factory
+from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost, executor_factory
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 from orchestrate.runner.progress import Tally
 from orchestrate.runner.saving import RetryingStore

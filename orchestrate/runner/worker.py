@@ -21,8 +21,7 @@ from dopt.spec.config import completed
 from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config.launch_settings import LaunchSettings, factor
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Task
-from orchestrate.executors.registry import make_executor
+from orchestrate.executors.base import Task, make_executor
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
 from orchestrate.runner.progress import (

@@ -17,8 +17,7 @@ from pathlib import Path
 
 from sqlalchemy import URL, Connection, bindparam, select, text, update
 
-from dopt.spec.config import REGISTRIES, section_class
-from dopt.spec.label import config_label
+from dopt.spec.config import REGISTRIES, config_label, section_class
 from orchestrate.errors import NoDatabaseError, StoreError
 from orchestrate.files import whole
 from orchestrate.store import database_url, launches, records, schema
