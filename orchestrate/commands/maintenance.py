@@ -1,4 +1,4 @@
-"""Commands that check or change a whole database, from ``merge`` to ``vacuum``."""
+"""Commands that check or change a whole database, from ``merge`` to ``prune``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from datetime import UTC, datetime, timedelta
 
 from dopt.errors import given_path
 from orchestrate.commands.command import (
-    PROGRAM,
     Command,
     add_filters,
     answer,
@@ -32,7 +31,6 @@ from orchestrate.store.maintenance import (
     merge_collected,
     prunable,
     upgrade,
-    vacuum,
 )
 from orchestrate.store.merge import Merged, TrialName, merge
 from orchestrate.store.records import utc_text
@@ -302,18 +300,7 @@ def _prune_sentence(found: Prunable, deleted: int, *, dry: bool) -> str:
     if dry:
         trials = f"{len(found.keys):,} trials would be deleted ({kinds})"
         return f"{trials}: {size}; nothing was changed.{rest}"
-    space = f"{PROGRAM} vacuum gives the space back"
-    return f"{deleted:,} trials were deleted ({kinds}): {size}; {space}.{rest}"
+    return f"{deleted:,} trials were deleted ({kinds}): {size}.{rest}"
 
 
 PRUNE_COMMAND = Command("prune", "delete old or unwanted trials", _run_prune, _add_prune_arguments)
-
-
-def _run_vacuum(arguments: argparse.Namespace) -> ExitCode:
-    """Vacuum the database and print its size before and after."""
-    done = vacuum(arguments.db)
-    sizes = f"{done.before:,} bytes before, {done.after:,} bytes now"
-    return answer(arguments, asdict(done), f"{done.safe_url}: {sizes}")
-
-
-VACUUM_COMMAND = Command("vacuum", "give the space of deleted rows back", _run_vacuum)

@@ -1,4 +1,4 @@
-"""Maintenance of databases: backup, vacuum, upgrade, shared copies, and what can be pruned.
+"""Maintenance of databases: backup, upgrade, shared copies, and what can be pruned.
 
 In an upgrade the check for running launches, the backup, the migration and the labels of
 configurations are one exclusive transaction. The statements of a schema never change; what the
@@ -25,7 +25,6 @@ from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend, copy_checked, dump, translated, translated_file
 from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.doctor import TrialKey
-from orchestrate.store.launches import refuse_living
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.reader import Reader
 from orchestrate.store.schema import (
@@ -65,45 +64,6 @@ def _copy(parsed: URL, url: str, partial: Path) -> None:
         return
     with translated(database_url.safe(parsed), opening=True):
         copy_checked(existing_path(parsed), partial)
-
-
-@dataclass(frozen=True)
-class Vacuumed:
-    """Bytes of a database before and after."""
-
-    safe_url: str
-    before: int
-    after: int
-
-
-def vacuum(url: str) -> Vacuumed:
-    """Give the space of deleted rows back: SQLite to the disk, PostgreSQL to later rows.
-
-    SQLite writes the file again, for which as much space must be free on its disk, and lets nobody
-    else write meanwhile; PostgreSQL works beside launches. Raises as :meth:`Reader.open` does, and
-    ``LaunchAliveError`` if a launch is writing to a SQLite file.
-    """
-    before = _size(url)
-    backend = make_backend(database_url.parse(url))
-    try:
-        _vacuum(backend)
-    finally:
-        backend.close()
-    return Vacuumed(backend.safe_url, before, _size(url))
-
-
-def _size(url: str) -> int:
-    with Reader.open(url) as reader:
-        return reader.size()
-
-
-def _vacuum(backend: Backend) -> None:
-    if backend.needs_rest:
-        with backend.transaction() as connection:
-            schema.check(connection, backend.safe_url)
-            refuse_living(connection, backend)
-    with translated(backend.safe_url):
-        backend.vacuum()
 
 
 SUFFIX = ".db"

@@ -344,15 +344,6 @@ class Backend(ABC):
         """Return a unique name for a launch of this process."""
         return uuid.uuid4().hex
 
-    @property
-    @abstractmethod
-    def needs_rest(self) -> bool:
-        """Whether :meth:`vacuum` keeps launches from writing for as long as it takes."""
-
-    @abstractmethod
-    def vacuum(self) -> None:
-        """Free the space of deleted rows."""
-
     @abstractmethod
     def evict(self) -> None:
         """End the transactions of dead launches, which could keep their locks forever."""

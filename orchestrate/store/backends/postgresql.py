@@ -109,9 +109,6 @@ _EVICT = text(
     """
 )
 _OWN = "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace(current_schema())"
-_TABLES = text(
-    f"SELECT oid::regclass::text {_OWN} AND relname NOT IN ('alembic_version', '{LOCK_TABLE}')"
-)
 _SCHEMA = text("SELECT current_schema(), quote_ident(current_schema())")
 _SIZE = text(f"SELECT coalesce(sum(pg_total_relation_size(oid)), 0) {_OWN}")
 _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
@@ -227,17 +224,6 @@ class PostgreSQLBackend(Backend):
 
     def token(self) -> str:
         return f"{self._session}-{super().token()}"
-
-    @property
-    def needs_rest(self) -> bool:
-        return False
-
-    def vacuum(self) -> None:
-        with self.engine.connect() as connection:
-            tables = ", ".join(connection.execute(_TABLES).scalars())
-            connection.rollback()
-            alone = connection.execution_options(isolation_level="AUTOCOMMIT")
-            alone.exec_driver_sql(f"VACUUM (ANALYZE) {tables}")
 
     def evict(self) -> None:
         # In a short transaction of its own: it reads a table that an upgrade locks.

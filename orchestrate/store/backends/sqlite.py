@@ -175,19 +175,6 @@ class SQLiteBackend(Backend):
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
 
-    @property
-    def needs_rest(self) -> bool:
-        return True
-
-    def vacuum(self) -> None:
-        self.check()
-        with self.engine.connect() as connection:
-            driver = driver_of(connection)
-            driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 1)  # the new file
-            driver.execute("VACUUM")
-            driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-            driver.execute(_TRUNCATE)
-
     def evict(self) -> None:
         """Do nothing: the kernel releases the locks of a dead process."""
 

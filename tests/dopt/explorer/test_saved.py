@@ -92,7 +92,6 @@ def test_commands_show_it(
     line = "plant, random, prequential loss, seed 0: running, 40 of 300 steps"
     assert line in said("status")
     assert "running, 40 of 300 steps" in said("show")
-    assert "prequential loss, log scale, 40 steps" in said("show")
     assert "40" in said("query", "SELECT count(*) AS n FROM v_curve WHERE env = 'plant'")
     for kind in ("curves", "trajectories", "trials"):
         for form in ("csv", "parquet"):

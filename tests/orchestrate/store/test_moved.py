@@ -16,7 +16,7 @@ from orchestrate.errors import StoreError
 from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store
 from orchestrate.store.backends import sqlite, sqlite_engine
 from orchestrate.store.backends.sqlite_engine import is_network, mount_of
-from orchestrate.store.maintenance import upgrade, vacuum
+from orchestrate.store.maintenance import upgrade
 from orchestrate.store.merge import merge
 from orchestrate.store.store import make_backend
 from tests.orchestrate.store.databases import file_of
@@ -183,7 +183,6 @@ WRITERS: dict[str, Callable[[Store, int, list[Claim]], object]] = {
     "prune": lambda store, *_: store.prune([SPECS[0].trial_key]),
     "save": lambda store, launch, _: store.save(launch, Spec(60), result(), RUN),
     "holds_more": lambda store, *_: store.holds_more(Spec(60), result()),
-    "vacuum": lambda store, *_: store._backend.vacuum(),
     "check": lambda store, *_: store.check(),
 }
 
@@ -199,14 +198,14 @@ def test_every_writer_notices(writer: str, url: str, folder: Path, other: Path) 
     assert file_of(url).read_bytes() == other.read_bytes()
 
 
-@pytest.mark.parametrize("command", ["merge", "upgrade", "vacuum"])
+@pytest.mark.parametrize("command", ["merge", "upgrade"])
 def test_a_command_notices(
     command: str, url: str, folder: Path, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Store.open(url).close()
     kept = other.read_bytes()
     remember = sqlite.SQLiteBackend._remember
-    calls = {"merge": 2, "upgrade": 1, "vacuum": 1}
+    calls = {"merge": 2, "upgrade": 1}
 
     def lost(backend: sqlite.SQLiteBackend) -> None:
         remember(backend)
@@ -218,7 +217,6 @@ def test_a_command_notices(
     commands: dict[str, Callable[[], object]] = {
         "merge": lambda: merge(url, f"sqlite:///{other}"),
         "upgrade": lambda: upgrade(url, backup=False),
-        "vacuum": lambda: vacuum(url),
     }
     with pytest.raises(DatabaseMovedError, match="replaced by another file"):
         commands[command]()
