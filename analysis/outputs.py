@@ -46,7 +46,6 @@ _PLOTS = {
     "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
     "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
     "figure2_spectrum": ("phase_portraits", "spectrum_plot", "cartpole"),
-    "figure5_control": ("loss_curves", "CONTROL"),
     "figure6_pareto": ("pareto", "PARETO"),
 }
 """Module, name and subject of each figure, in the order of the page."""

@@ -43,6 +43,7 @@ SUCCESSORS = {
     "analysis --figures": "open README.md in the folder of figures",
     "figure4_width": "python -m studies.speed.width prints the cost of a step",
     "figure4_width_loss": "python -m analysis summary --group-by width shows the losses",
+    "figure5_control": "python -m analysis report has a table of success and cost of control",
     "figure7_profiles": "python -m analysis aggregate compares over all systems",
     "figure8_sensitivity": "python -m analysis summary --group-by learner.window shows each value",
     "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",

@@ -14,7 +14,6 @@ from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from analysis.data.matching import choose
 from analysis.data.samples import DivergenceRule, read_sample
@@ -526,22 +525,3 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
     by_seed = dict(zip(seeds.tolist(), column.tolist(), strict=True))
     names = entry.config.env, entry.config.policy, entry.label
     return Scores(*names, by_seed, len(costs.seeds), int(np.sum(costs.diverged)))
-
-
-def tabulate_control(curves: Iterable[ControlCurve]) -> pd.DataFrame:
-    """Return what is drawn, one row for each environment, policy and number of steps."""
-    columns = (
-        *("t", "n", "success", "success_low", "success_high"),
-        *("cost", "cost_low", "cost_high", "lost"),
-    )
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {"env": curve.env, "policy": curve.policy}
-                | {name: getattr(curve, name) for name in columns}
-                | {"true_model_success": curve.truth.success}
-            )
-            for curve in curves
-        ],
-        ignore_index=True,
-    )
