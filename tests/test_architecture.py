@@ -61,8 +61,7 @@ ORCHESTRATE_IMPORTS = {
     "executors": BASE | {"config", "fingerprint"},
     "store": {"errors", "records", "files"},
     "runner": BASE | {"config", "executors", "fingerprint", "store"},
-    "export": BASE | {"store"},
-    "commands": BASE | {"export", "runner", "store"},
+    "commands": BASE | {"runner", "store"},
     "launch": BASE | {"config", "executors", "runner"},
     "__main__": BASE | {"commands"},
 }

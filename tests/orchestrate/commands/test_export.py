@@ -15,7 +15,7 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 
-from orchestrate import export as tables
+from orchestrate.commands import export as tables
 from orchestrate.store import Claim, Store
 from tests.orchestrate.commands.conftest import (
     BAD,
