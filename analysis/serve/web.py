@@ -28,7 +28,7 @@ from analysis.data.selection import Selection, select
 from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
-from orchestrate.store.database_url import parse, safe, sqlite_path
+from orchestrate.store.backends.base import parse_url, public_url, sqlite_path
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -229,8 +229,8 @@ class Database:
     """Access to the database at a URL, which may be missing, created later or replaced."""
 
     def __init__(self, url: str) -> None:
-        parsed = parse(url)
-        self.safe_url = safe(parsed)
+        parsed = parse_url(url)
+        self.safe_url = public_url(parsed)
         self._url = url
         self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
         self._lock = threading.Lock()

@@ -14,7 +14,8 @@ from functools import partial
 from typing import Literal
 
 from orchestrate.errors import StoreUnavailableError
-from orchestrate.store import database_url, records
+from orchestrate.store import records
+from orchestrate.store.backends.base import parse_url
 from orchestrate.store.reader import Reader
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, SAMPLE_LOSS, STEP_VALUES
 
@@ -82,7 +83,7 @@ def examine(url: str, trial_key: TrialKey | None = None) -> list[Finding]:
     StoreError
         As :meth:`Reader.open` does; damage to a file that can still be opened is a finding.
     """
-    parsed = database_url.parse(url)
+    parsed = parse_url(url)
     is_file = parsed.get_backend_name() == "sqlite"
     findings: list[Finding] = []
     try:

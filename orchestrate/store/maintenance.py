@@ -20,9 +20,18 @@ from sqlalchemy import URL, Connection, bindparam, select, text, update
 from dopt.spec.config import REGISTRIES, config_label, section_class
 from orchestrate.errors import NoDatabaseError, StoreError
 from orchestrate.files import whole
-from orchestrate.store import database_url, launches, records, schema
+from orchestrate.store import launches, records, schema
 from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.base import Backend, copy_checked, dump, translated, translated_file
+from orchestrate.store.backends.base import (
+    Backend,
+    copy_checked,
+    dump,
+    parse_url,
+    public_url,
+    sqlite_path,
+    translated,
+    translated_file,
+)
 from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.merge import Merged, merge
@@ -52,7 +61,7 @@ def back_up(url: str, target: Path) -> int:
     if target.exists():
         raise StoreError(f"The file {target} exists, a new one is expected: give another name.")
     with whole(target, "FILE") as partial:
-        _copy(database_url.parse(url), url, partial)
+        _copy(parse_url(url), url, partial)
     return target.stat().st_size
 
 
@@ -62,7 +71,7 @@ def _copy(parsed: URL, url: str, partial: Path) -> None:
             ((schema,),) = reader.rows("SELECT quote_ident(current_schema())")
         dump(parsed, schema, partial)
         return
-    with translated(database_url.safe(parsed), opening=True):
+    with translated(public_url(parsed), opening=True):
         copy_checked(existing_path(parsed), partial)
 
 
@@ -75,7 +84,7 @@ def collect(url: str, folder: Path) -> None:
     Raises ``StoreUnavailableError`` if the folder has no room or fails, and ``StoreError`` if it
     can never be written; an older copy stays then.
     """
-    path = database_url.sqlite_path(database_url.parse(url))
+    path = sqlite_path(parse_url(url))
     partial = folder / f"{path.name}.{os.getpid()}.partial"
     with (
         translated_file(str(folder)),
@@ -231,7 +240,7 @@ def upgrade(url: str, backup: bool = True) -> Upgrade:
     StoreUnavailableError
         If the database fails; it is then unchanged.
     """
-    parsed = database_url.parse(url)
+    parsed = parse_url(url)
     if parsed.get_backend_name() == "sqlite":
         sqlite.existing_path(parsed)
     backend = make_backend(parsed)

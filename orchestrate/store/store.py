@@ -8,8 +8,8 @@ from typing import Self
 from sqlalchemy import URL
 
 from orchestrate.records import Failure, RunRecord
-from orchestrate.store import database_url, launches, results, schema
-from orchestrate.store.backends.base import Backend
+from orchestrate.store import launches, results, schema
+from orchestrate.store.backends.base import Backend, parse_url
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
 from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
@@ -55,7 +55,7 @@ class Store:
         alive; on SQLite a file lock decides. ``patience`` bounds the wait for a lock of another
         process [s]. Raises ``SchemaVersionError`` for another version.
         """
-        backend = make_backend(database_url.parse(url), lease_seconds, patience)
+        backend = make_backend(parse_url(url), lease_seconds, patience)
         try:
             with backend.creation() as connection:
                 schema.create_or_check(connection, backend.safe_url)

@@ -32,7 +32,6 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
 from orchestrate.errors import StoreError, StoreUnavailableError
-from orchestrate.store import database_url
 from orchestrate.store.backends.base import (
     ANNOUNCE_SECONDS,
     Backend,
@@ -41,6 +40,7 @@ from orchestrate.store.backends.base import (
     back_up_to,
     dump,
     log,
+    public_url,
 )
 from orchestrate.store.records import Array, finite_list
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
@@ -121,7 +121,7 @@ class PostgreSQLBackend(Backend):
         self._session = uuid.uuid4().hex
         self._url = url
         engine = _write_engine(url, lease_seconds, patience, self._session)
-        super().__init__(engine, database_url.safe(url))
+        super().__init__(engine, public_url(url))
         self._lease_seconds = lease_seconds
         self._patience = patience
 

@@ -16,14 +16,15 @@ from sqlalchemy import URL, Connection, Select, func, insert, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from orchestrate.errors import DatabaseMovedError, StoreError, StoreUnavailableError
-from orchestrate.store import database_url
 from orchestrate.store.backends.base import (
     Backend,
     LaunchLife,
     NewTrial,
     back_up_to,
     copy_checked,
+    public_url,
     rescue,
+    sqlite_path,
     translated_file,
 )
 from orchestrate.store.backends.sqlite_engine import (
@@ -55,7 +56,7 @@ class SQLiteBackend(Backend):
     """SQLite file, with its locks in the folder ``<file>-locks`` beside it."""
 
     def __init__(self, url: URL, patience: float) -> None:
-        self._path = database_url.sqlite_path(url)
+        self._path = sqlite_path(url)
         self._given = Path(str(url.database)).absolute()
         self._folder = _locks_folder(self._path)
         self._patience = patience
@@ -65,7 +66,7 @@ class SQLiteBackend(Backend):
         self._saved: Path | None = None
         self._checking = threading.RLock()
         engine = write_engine(self._connect, self._path, patience)
-        super().__init__(engine, database_url.safe(url))
+        super().__init__(engine, public_url(url))
         refuse_unsafe(self._path, self.safe_url)
         with translated_file(self.safe_url):
             if self._path.is_dir():
@@ -256,8 +257,8 @@ def _insert_block(n: int) -> str:
 
 def dead(url: URL, _: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
     """Return the launches whose process is gone, for a reader."""
-    locks = LaunchLocks(_locks_folder(database_url.sqlite_path(url)))
-    with translated_file(database_url.safe(url)):
+    locks = LaunchLocks(_locks_folder(sqlite_path(url)))
+    with translated_file(public_url(url)):
         return [launch for launch in launches if not locks.is_held(launch.token)]
 
 

@@ -24,8 +24,13 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.pool import QueuePool
 
 from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
-from orchestrate.store import database_url
-from orchestrate.store.backends.base import ANNOUNCE_SECONDS, log, translated_file
+from orchestrate.store.backends.base import (
+    ANNOUNCE_SECONDS,
+    log,
+    public_url,
+    sqlite_path,
+    translated_file,
+)
 from orchestrate.store.schema import VIEWS
 
 MOUNT_TABLE = Path("/proc/self/mountinfo")
@@ -247,12 +252,12 @@ def _reader(path: Path) -> sqlite3.Connection:
 
 def existing_path(url: URL) -> Path:
     """Return the path of a database; raise ``NoDatabaseError`` if there is no file."""
-    path = database_url.sqlite_path(url)
-    with translated_file(database_url.safe(url)):
+    path = sqlite_path(url)
+    with translated_file(public_url(url)):
         there = path.is_file()
     if not there:
         raise NoDatabaseError(
-            f"There is no results database at {database_url.safe(url)}: run a launch that writes "
+            f"There is no results database at {public_url(url)}: run a launch that writes "
             "it, or give the URL of another one (--db, or the variable DOPT_DB)."
         )
     return path
