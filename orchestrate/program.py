@@ -6,7 +6,6 @@ Messages of the parser are one sentence with the nearest valid name.
 from __future__ import annotations
 
 import argparse
-import codecs
 import errno
 import functools
 import importlib
@@ -19,7 +18,6 @@ import signal
 import subprocess
 import sys
 import traceback
-import unicodedata
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -241,12 +239,6 @@ COMMIT_VARIABLE = "DOPT_COMMIT"
 
 LIMITS = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 """Errors of a system that gives no more; it may at another time."""
-
-_ASCII = {
-    **dict(zip("·–—−×∝▁▂▃▄▅▆▇█", "----x~_.:-=+*#", strict=True)),
-    **{"±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "‖": "||", "°": "deg"},
-    "\N{COMBINING DOT ABOVE}": "'",
-}
 
 Parameters = ParamSpec("Parameters")
 
@@ -471,33 +463,10 @@ def _open_streams() -> None:
 
 
 def readable_streams() -> None:
-    """Let letters that a terminal does not know be written in ASCII."""
-    codecs.register_error("readable", _in_ascii)
+    """Let letters that a terminal does not know be written as their codes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="readable")
-
-
-def _in_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Return ``+-`` for ±, ``^2`` for ², ``theta`` for θ; an escape for what has no such form."""
-    assert isinstance(error, UnicodeEncodeError)
-    text, raised = "", False
-    for char in error.object[error.start : error.end]:
-        before, raised = raised, unicodedata.decomposition(char).startswith("<super>")
-        text += ("^" if raised and not before else "") + _plain(char)
-    return text, error.end
-
-
-def _plain(char: str) -> str:
-    if char in _ASCII or char.isascii():
-        return _ASCII.get(char, char)
-    words = unicodedata.name(char, "").split()
-    if words[:1] == ["GREEK"] and "LETTER" in words:
-        return words[-1].capitalize() if "CAPITAL" in words else words[-1].lower()
-    parts = unicodedata.normalize("NFKD", char)
-    if parts != char:
-        return "".join(map(_plain, parts))
-    return "" if unicodedata.combining(char) else ascii(char)[1:-1]
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _tolerate_warnings() -> None:

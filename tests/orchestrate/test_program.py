@@ -33,6 +33,7 @@ from orchestrate.program import as_started
 from orchestrate.runner.saving import launch_record
 from orchestrate.store import StoreUnavailableError
 from tests.orchestrate.conftest import Launches
+from tests.orchestrate.framed import LETTERS
 from tests.paths import ROOT, without_coverage
 
 PROGRAMS = (["orchestrate/launch.py"], ["-m", "orchestrate"], ["-m", "analysis"])
@@ -177,8 +178,8 @@ def waiting(before: Callable[[], Any] | None = None) -> subprocess.Popen[str]:
     return running
 
 
-def test_letters_that_a_terminal_does_not_know_are_written_in_ascii() -> None:
-    plain = "0 - +- 2 degC, m/s^2, 10^-12, theta' <= gamma, Omega, e, \\u6771"
+def test_letters_that_a_terminal_does_not_know_are_written_as_their_codes() -> None:
+    plain = LETTERS.encode("ascii", "backslashreplace").decode()
     done = started("letters", PYTHONIOENCODING="ascii:strict")
     assert (done.returncode, done.stdout) == (5, plain)
     assert done.stderr == f"{plain}\n"
