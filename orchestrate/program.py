@@ -47,7 +47,6 @@ SUCCESSORS = {
     "figure7_profiles": "python -m analysis aggregate compares over all systems",
     "figure8_sensitivity": "python -m analysis summary --group-by learner.window shows each value",
     "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",
-    "orchestrate retry": "give the launch command again with launch.retry=failed, diverged or all",
     "orchestrate vacuum": "sqlite3 FILE VACUUM, or VACUUM in psql, gives the space back",
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
     "--live": "look at the progress of a launch with python -m orchestrate status --watch",

@@ -12,6 +12,7 @@ COMMANDS: tuple[Command, ...] = (
     status.WORK_COMMAND,
     status.STATUS_COMMAND,
     results.SHOW_COMMAND,
+    maintenance.RETRY_COMMAND,
     results.QUERY_COMMAND,
     export.EXPORT_COMMAND,
     maintenance.MERGE_COMMAND,

@@ -18,7 +18,7 @@ from orchestrate.store.maintenance import back_up
 from orchestrate.store.merge import merge
 from orchestrate.store.records import utc_text
 from orchestrate.store.schema import SCHEMA_VERSION
-from tests.orchestrate.commands.conftest import BAD, DONE, RUNNING, WAITING, Answer, on_both
+from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer, on_both
 from tests.orchestrate.standins import specification
 from tests.orchestrate.store.databases import execute, restored
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, everything, result, run_all
@@ -291,3 +291,70 @@ class TestPrune:
         assert answer.code == 2
         assert message in answer.err
         assert everything(url) == before
+
+
+def statuses(url: str) -> dict[str, str]:
+    with Reader.open(url) as reader:
+        return {row[0]: row[1] for row in reader.rows("SELECT trial_key, status FROM trial")}
+
+
+@on_both
+def test_failed_trials_wait_again(ask: Run, url: str) -> None:
+    before = statuses(url)
+    answer = ask("retry", "failed")
+    assert answer.code == 0
+    assert "2 failed trials wait to be run again: the same launch command" in answer.out
+    changed = {key for key, status in statuses(url).items() if status != before[key]}
+    assert changed == {spec.trial_key for spec in BROKEN}
+    assert "There is no failed trial to retry." in ask("retry", "failed").out
+
+
+@on_both
+def test_diverged_trials_lose_what_they_had_written(ask: Run, url: str) -> None:
+    assert "1 diverged trial waits" in ask("retry", "diverged").out
+    assert statuses(url)[BAD.trial_key] == "pending"
+    with Reader.open(url) as reader:
+        assert len(reader.trials(BAD.config_key)) == 3
+        assert reader.curves(BAD.config_key).values.shape[0] == 0
+
+
+def test_all_of_them(ask: Run, url: str) -> None:
+    document = ask("retry", "all", "--json").document
+    assert document["trials"] == 3
+    assert set(document["keys"]) == {spec.trial_key for spec in (*BROKEN, BAD)}
+    assert document["left"] == {"done": 3, "running": 1, "pending": 2}
+    assert "failed" not in statuses(url).values()
+
+
+def test_a_dry_run_changes_nothing(ask: Run, url: str) -> None:
+    before = statuses(url)
+    answer = ask("retry", "all", "--dry-run")
+    assert "3 unsuccessful trials would wait to be run again; nothing was changed." in answer.out
+    assert ask("retry", "all", "--dry-run", "--json").document["dry_run"] is True
+    assert statuses(url) == before
+
+
+def test_filters_narrow_it(ask: Run, url: str) -> None:
+    assert "no failed trial" in ask("retry", "failed", "--env", "cartpole").out
+    answer = ask("retry", "failed", "--trial", BROKEN[0].trial_key[:10])
+    assert "1 failed trial waits" in answer.out
+    assert statuses(url)[BROKEN[0].trial_key] == "pending"
+    assert statuses(url)[BROKEN[1].trial_key] == "failed"
+
+
+def test_it_says_what_is_left_as_it_is(ask: Run, url: str) -> None:
+    named = [spec.trial_key for spec in (DONE[0], RUNNING)]
+    answer = ask("retry", "failed", "--trial", *named)
+    assert answer.out == (
+        "There is no failed trial to retry. Left as they are: 1 done, 1 running.\n"
+    )
+    assert statuses(url)[RUNNING.trial_key] == "running"
+
+
+@pytest.mark.parametrize("key", ["0000000000000000", "xyz", "ab"])
+def test_a_key_that_names_no_trial_is_refused(ask: Run, url: str, key: str) -> None:
+    before = statuses(url)
+    answer = ask("retry", "all", "--trial", BROKEN[0].trial_key, key)
+    assert answer.code == 2
+    assert key in answer.err
+    assert statuses(url) == before

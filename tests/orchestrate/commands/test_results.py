@@ -42,6 +42,7 @@ from tests.waiting import PATIENCE_SECONDS
 READING = [
     ["status"],
     ["show", "--seed", "1"],
+    ["retry", "failed"],
     ["query", "SELECT 1"],
     ["export", "curves", "--out", "curves.csv"],
 ]
@@ -83,7 +84,8 @@ def test_every_command_has_help_and_the_common_options(command: Command, capsys:
     [
         (["statsu"], "did you mean 'status'?"),
         (["status", "--evn", "pendulum"], "did you mean '--env'?"),
-        (["retry", "failed"], "'orchestrate retry' was removed: give the launch command again"),
+        (["retry", "faild"], "did you mean 'failed'?"),
+        (["retry"], "see python -m orchestrate retry --help"),
         (["status", "more"], "unexpected argument 'more'"),
         (["query", "SELECT 1", "--limit", "0"], "a whole number above 0 is expected"),
         (["query", "SELECT 1", "--timeout", "nan"], "a number above 0 is expected"),
