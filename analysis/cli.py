@@ -23,8 +23,8 @@ from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
-from analysis.stats.curves import Axis, PlotOptions
-from analysis.stats.intervals import Statistic
+from analysis.stats.curves import Axis, PlotOptions, Spread
+from analysis.stats.intervals import BandKind, Statistic
 from analysis.stats.scores import Measure
 from analysis.tables.rendering import (
     CALIBRATION,
@@ -81,6 +81,15 @@ def parser() -> Parser:
     figures.add_argument("--x", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1")
     figures.add_argument(
         "--statistic", choices=list(Statistic), default=Statistic.MEAN, help="centre of figure 1"
+    )
+    figures.add_argument(
+        "--style", choices=list(Spread), default=Spread.BAND, help="intervals of figure 1"
+    )
+    figures.add_argument(
+        "--band",
+        choices=list(BandKind),
+        default=BandKind.CONFIDENCE,
+        help="intervals of figure 1: of the centre, or what holds 90 %% of the runs",
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     cores = usable_cores()
@@ -231,8 +240,10 @@ def _plot_options(options: argparse.Namespace) -> PlotOptions:
         "rule": ("diverged", DivergenceRule),
         "axis": ("x", Axis),
         "statistic": ("statistic", Statistic),
+        "spread": ("style", Spread),
         "epsilon": ("epsilon", None),
         "color_by": ("color_by", None),
+        "band": ("band", BandKind),
     }
     found: dict[str, Any] = {
         field: kind(getattr(options, name)) if kind else getattr(options, name)

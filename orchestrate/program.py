@@ -38,8 +38,6 @@ _INSTALLED = {
 
 
 SUCCESSORS = {
-    "analysis --style": "figure 1 draws its intervals as bands",
-    "analysis --band": "analysis.load().curves() has every run, for other intervals",
     "analysis --figures": "open README.md in the folder of figures",
     "figure4_width": "python -m studies.speed.width prints the cost of a step",
     "figure4_width_loss": "python -m analysis summary --group-by width shows the losses",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,6 +18,7 @@ from analysis.data.selection import policy_rank, why_impossible
 from analysis.figures.panels import (
     Plot,
     blank,
+    half_widths,
     legend_below,
     log_scale,
     look,
@@ -29,10 +31,12 @@ from analysis.stats.curves import (
     Limits,
     LossCurve,
     PlotOptions,
+    Spread,
     axis_parts,
     measure_curves,
     tabulate_curves,
 )
+from analysis.stats.intervals import FEWEST, BandKind
 from analysis.style import (
     GREY,
     LineStyle,
@@ -45,6 +49,10 @@ PANEL_HEIGHT = 2.3
 PLACES = {"loss": "grid", "reachable_loss": "reachable set"}
 """Points at which the error of the model is evaluated, by column of a step."""
 
+BARS = 12
+"""Steps at which error bars are drawn."""
+
+_SPREADS = {Spread.BAND: "bands", Spread.ERRORBAR: f"bars at {BARS} steps"}
 Numbers = tuple[str, PlotOptions, tuple[LossCurve, ...]]
 
 
@@ -76,7 +84,7 @@ def draw(numbers: Numbers) -> Figure:
     unit = "steps" if options.axis is Axis.STEPS else "s"
     for index, env in enumerate(envs):
         shown = [curve for curve in curves if curve.env == env]
-        panel = _panel(figure, grid[index], shown, list(_absent(curves, env)))
+        panel = _panel(figure, grid[index], shown, options.spread, list(_absent(curves, env)))
         if index + columns >= len(envs):
             panel[-1].set_xlabel(f"time t [{unit}]")
         panel[0].set_ylabel(loss_label(column, shown[0].unit, shown[0].is_prequential))
@@ -90,18 +98,19 @@ def _panel(
     figure: Figure,
     place: SubplotSpec,
     curves: Sequence[LossCurve],
+    spread: Spread,
     absent: Sequence[str],
 ) -> list[Axes]:
     """Draw one environment, on an axis of two parts where a curve is far below the others."""
     parts = axis_parts([curve.band for curve in curves])
     if parts.lower is None:
         axes = [figure.add_subplot(place)]
-        _lines(axes[0], curves, parts.upper)
+        _lines(axes[0], curves, parts.upper, spread)
     else:
         two = place.subgridspec(2, 1, height_ratios=(2.6, 1), hspace=0.03)
         axes = [figure.add_subplot(two[0]), figure.add_subplot(two[1])]
-        _lines(axes[0], curves, parts.upper)
-        _lines(axes[1], curves, parts.lower)
+        _lines(axes[0], curves, parts.upper, spread)
+        _lines(axes[1], curves, parts.lower, spread)
         mark_break(*axes)
     counts = {curve.label: curve.sample.describe() for curve in curves}
     text = "; no ".join([count_text(counts), *map(policy_title, absent)])
@@ -117,13 +126,28 @@ def _absent(curves: Sequence[LossCurve], env: str) -> dict[str, str]:
     return {policy: reason for policy, reason in reasons.items() if reason}
 
 
-def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits) -> None:
-    for curve in reversed(curves):
+def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits, spread: Spread) -> None:
+    for place, curve in reversed(list(enumerate(curves))):
         style, band = curve.style, curve.band
         axes.plot(curve.x, band.centre, **look(style))
-        shade(axes, curve.x, band, style.colour)
+        if spread is Spread.BAND:
+            shade(axes, curve.x, band, style.colour)
+        else:
+            _bars(axes, curve, (place + 1) / (len(curves) + 1))
     log_scale(axes, *limits)
     axes.set_xlim(0, max(_end(curve) for curve in curves))
+
+
+def _bars(axes: Axes, curve: LossCurve, phase: float) -> None:
+    """Draw the interval at a few steps; ``phase`` in (0, 1) keeps the policies' bars apart."""
+    steps = len(curve.x)
+    shown = np.unique(((np.arange(BARS) + phase) * steps / BARS).astype(int))
+    band = curve.band
+    half = half_widths(band.centre[shown], band.low[shown], band.high[shown])
+    axes.errorbar(
+        curve.x[shown], band.centre[shown], half, color=curve.style.colour,
+        ls="none", elinewidth=0.8, capsize=1.6, capthick=0.8,
+    )  # fmt: skip
 
 
 def loss_label(column: str, unit: str, is_prequential: bool = False) -> str:
@@ -142,6 +166,15 @@ def _breaks(curves: Sequence[LossCurve]) -> str:
                 "parts have different scales. "
             )
     return ""
+
+
+def _bandless(curves: Sequence[LossCurve], options: PlotOptions) -> str:
+    """Return which lines have no tolerance band, or nothing."""
+    if options.band is not BandKind.TOLERANCE:
+        return ""
+    few = [curve for curve in curves if curve.band.n < FEWEST]
+    lines = ", ".join(f"{environment_title(one.env)} {one.label} (n = {one.band.n})" for one in few)
+    return f"No band, as fewer than {FEWEST} trials have none: {lines}. " if few else ""
 
 
 def _title(env: str, counts: str) -> str:
@@ -163,7 +196,10 @@ def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> lis
     handles: list[Artist] = [
         Line2D([], [], label=label, **look(style)) for label, style in styles.items()
     ]
-    return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=options.interval)]
+    name = options.interval
+    if options.spread is Spread.BAND:
+        return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=name)]
+    return [*handles, Line2D([], [], ls="none", marker="|", ms=9, mew=1, color=GREY, label=name)]
 
 
 def caption(numbers: Numbers) -> str:
@@ -183,10 +219,10 @@ def caption(numbers: Numbers) -> str:
     }
     return (
         f"{_what(column, curves)} against time t, one panel per environment. "
-        f"Lines: {options.statistic.label} over trials; bands: {options.interval}; "
-        f"no smoothing. {_breaks(curves)}{rules[options.rule]} Policies of one environment share "
-        f"initial weights and noise for the same seed.{''.join(absent)} "
-        f"Trials: {'. '.join(counts)}."
+        f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
+        f"{options.interval}; no smoothing. {_bandless(curves, options)}"
+        f"{_breaks(curves)}{rules[options.rule]} Policies of one environment share initial "
+        f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 from analysis.data.matching import check_keys, setting_value
 from analysis.data.samples import DivergenceRule, Sample, read_sample
 from analysis.data.selection import Entry, Selection
-from analysis.stats.intervals import Band, Statistic, band
+from analysis.stats.intervals import Band, BandKind, Statistic, band, tolerance_band
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
 from dopt.assessment import TURN, Plane, turns, wrap
 from dopt.spec.trial import is_prequential, system_of
@@ -29,24 +29,33 @@ class Axis(StrEnum):
     SECONDS = "seconds"
 
 
+class Spread(StrEnum):
+    """Drawing of the interval of a loss curve: a band over all steps, or bars at a few."""
+
+    BAND = "band"
+    ERRORBAR = "errorbar"
+
+
 @dataclass(frozen=True)
 class PlotOptions:
     """Options of the plots; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
-    ``axis``, ``statistic`` and ``color_by``, the setting whose values have a colour each, belong to
-    the loss curves.
+    ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
+    each, and ``band``, what the intervals are of, belong to the loss curves.
     """
 
     rule: DivergenceRule = DivergenceRule.EXCLUDE
     axis: Axis = Axis.STEPS
     statistic: Statistic = Statistic.MEAN
+    spread: Spread = Spread.BAND
     epsilon: float | None = None
     color_by: str | None = None
+    band: BandKind = BandKind.CONFIDENCE
 
     @property
     def interval(self) -> str:
         """Return the name of the intervals of the loss curves."""
-        return self.statistic.band
+        return self.band.label(self.statistic)
 
     def as_dict(self) -> dict[str, str]:
         return {key: str(value) for key, value in asdict(self).items()}
@@ -168,11 +177,12 @@ def _curve(
     config, sample = entry.config, read_sample(reader, entry, column, options.rule)
     t = np.arange(sample.values.shape[1])
     system = system_of(config.config)
+    limits = tolerance_band if options.band is BandKind.TOLERANCE else band
     return LossCurve(
         *(config.env, config.policy, entry.label, style, t),
         x=(system.dt if options.axis is Axis.SECONDS else 1.0) * t.astype(float),
         unit=loss_unit(system),
-        band=band(sample.values, options.statistic),
+        band=limits(sample.values, options.statistic),
         statistic=options.statistic,
         sample=sample,
         is_prequential=is_prequential(config.config),

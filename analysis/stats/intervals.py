@@ -4,6 +4,11 @@ Three statistics over the trials of a configuration, each with the interval that
 with Student's interval, and the median and the interquartile mean (IQM: the mean of the middle
 half; Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", 2021)
 with a percentile bootstrap that draws whole trials.
+
+Tolerance intervals say what one run does, where an interval of the mean says what they do together.
+They are distribution-free, by order statistics (Wilks, "Determination of sample sizes for setting
+tolerance limits", 1941): of n independent runs sorted by value, the share of the distribution
+between the r-th smallest and the s-th smallest has the distribution Beta(s - r, n - s + r + 1).
 """
 
 from __future__ import annotations
@@ -43,6 +48,12 @@ _ROUNDING = 1e-14
 
 STUDENT_RANGE = f"Student's below {FEWEST_BOOTSTRAP_VALUES} and above {MOST_BOOTSTRAP_VALUES}"
 """Numbers of values whose interval is Student's, for the notes of tables and figures."""
+
+CONTENT = 0.9
+"""Share of the runs that an interval is to hold."""
+
+FEWEST = 46
+"""Runs below which no two of them hold that share with that confidence."""
 
 
 class Statistic(StrEnum):
@@ -217,6 +228,50 @@ _CENTRES: dict[Statistic, Any] = {
     Statistic.MEDIAN: np.median,
     Statistic.IQM: _interquartile_mean,
 }
+
+
+class BandKind(StrEnum):
+    """Kind of interval around a curve: of the centre of the runs, or of single runs."""
+
+    CONFIDENCE = "confidence"
+    TOLERANCE = "tolerance"
+
+    def label(self, statistic: Statistic) -> str:
+        """Return the name in a caption, beside a centre."""
+        if self is BandKind.CONFIDENCE:
+            return statistic.band
+        content, confidence = (f"{100 * one:.0f} %" for one in (CONTENT, CONFIDENCE))
+        return f"tolerance interval, {content} of runs with {confidence} confidence"
+
+
+def tolerance_band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
+    """Return the centre of trials (n, T) and the limits that hold 90 % of runs, at each step.
+
+    Below :data:`FEWEST` trials the limits are NaN.
+    """
+    n = len(values)
+    middle, places = centre(values, statistic), tolerance_places(n)
+    if places is None:
+        return _without_interval(middle, n)
+    low, high = np.sort(values, axis=0)[list(places)]
+    return Band(middle, low, high, n)
+
+
+@functools.cache
+def tolerance_places(n: int) -> tuple[int, int] | None:
+    """Return the places, from 0, of the two limits among n sorted runs; None for too few.
+
+    As many runs are left out above as below, and as many as the confidence allows.
+    """
+    from scipy.special import betainc
+
+    left_out = np.arange(1, (n + 1) // 2)
+    inside = n + 1 - 2 * left_out
+    confident = 1 - betainc(inside, n + 1 - inside, CONTENT) >= CONFIDENCE
+    if not confident.any():
+        return None
+    most = int(left_out[confident].max())
+    return most - 1, n - most
 
 
 def stratified_mean(strata: Sequence[Array]) -> Band:
