@@ -248,15 +248,19 @@ class Reader:
         sql: str,
         limit: int | None = None,
         timeout: float | None = None,
+        login: URL | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> Table:
         """Return the rows of one SELECT, with values by position and by column name.
 
         Only the first ``limit`` rows are read; ``cut`` of the table is True if there are more.
-        The statement runs in a process and through a connection of its own. Raises ``QueryError``
-        if the database rejects the statement, such as one that writes or several in one text, or
-        if it takes longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
+        The statement runs in a process and through a connection of its own, with the URL ``login``
+        where one is given, until ``stopped`` says True. Raises ``QueryError`` if the database
+        rejects the statement, such as one that writes or several in one text, or if it takes
+        longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
         """
-        return run_select(self._kind.request(self._url), self.safe_url, sql, limit, timeout)
+        request = self._kind.request(login or self._url)
+        return run_select(request, self.safe_url, sql, limit, timeout, stopped)
 
     def rows(self, sql: str, /, **values: object) -> Table:
         """Return the rows of a trusted SELECT, with each ``:name`` in it bound to a value.

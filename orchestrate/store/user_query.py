@@ -12,7 +12,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -37,17 +37,18 @@ def run_select(
     sql: str,
     limit: int | None = None,
     timeout: float | None = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Table:
     """Return the first ``limit`` rows of the statement.
 
     ``request`` says how the driver connects. The process is killed after ``timeout`` seconds, when
-    its answer is too large, and with this process.
+    its answer is too large, when ``stopped`` says so, and with this process.
     """
     given = {"sql": sql, "seconds": timeout, "limit": None if limit is None else limit + 1}
     request = {**request, **given, "path": [folder for folder in sys.path if folder]}
     with translated_query(safe_url, timeout):
         with _process(request) as process:
-            answer = _read(process, timeout)
+            answer = _read(process, timeout, stopped)
         parts = [None, *_unpickled(answer)]
         end = parts.pop()
         if not isinstance(end, dict):
@@ -85,13 +86,15 @@ def _process(request: Request) -> Iterator[subprocess.Popen[bytes]]:
             process.kill()
 
 
-def _read(process: subprocess.Popen[bytes], seconds: float | None) -> bytes:
+def _read(
+    process: subprocess.Popen[bytes], seconds: float | None, stopped: Callable[[], bool]
+) -> bytes:
     """Return what the process writes; its time begins with the first byte."""
     assert process.stdout
     answer, end = bytearray(), float("inf")
     poll = select.poll()
     poll.register(process.stdout, select.POLLIN)
-    while True:
+    while not stopped():
         if time.monotonic() > end:
             raise out_of_time(seconds)
         if not poll.poll(_PAUSE_MILLISECONDS):
@@ -107,6 +110,7 @@ def _read(process: subprocess.Popen[bytes], seconds: float | None) -> bytes:
                 f"The result is larger than {RESULT_BYTES / 1e6:g} MB, the most that a query "
                 "returns: select fewer rows or columns, or take 'python -m orchestrate export'."
             )
+    raise QueryError("The query was cancelled, because nobody waits for it: run it again.")
 
 
 def _unpickled(answer: bytes) -> Iterator[Any]:

@@ -134,7 +134,7 @@ def client(url: str) -> Iterator[TestClient]:
 def test_the_pages_show_it_live(url: str, client: TestClient, run: Explorer) -> None:
     run.save(url, test=(run.states, run.inputs) if run.n_steps > 50 else None)
     key = content(url)["trial_key"]
-    for page in ("/", "/trials", f"/trials/{key}", "/curves"):
+    for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
         assert client.get(page).status_code == 200, page
     assert "prequential loss" in client.get("/").text
     assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text
