@@ -27,14 +27,19 @@ from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of, measured_names
-from dopt.fitting.predictions import (
+from dopt.fitting.problem import (
     HORIZONS,
     Predicted,
+    Simulator,
+    Solution,
+    Windows,
+    first_states,
     linear_predictions,
     predicted,
     prediction_rows,
+    solve,
+    windows_of,
 )
-from dopt.fitting.problem import Simulator, Solution, Windows, first_states, solve, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log
 from dopt.systems.plant import Encoder, Plant, Unknown, first_guess

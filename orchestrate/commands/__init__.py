@@ -20,6 +20,5 @@ COMMANDS: tuple[Command, ...] = (
     maintenance.UPGRADE_COMMAND,
     maintenance.BACKUP_COMMAND,
     maintenance.PRUNE_COMMAND,
-    maintenance.VACUUM_COMMAND,
 )
 """In the order in which the help shows them."""

@@ -21,8 +21,7 @@ from analysis.style import within
 from analysis.tables.rendering import TextTable
 from dopt.fitting.choice import State, segments_of
 from dopt.fitting.model import data_of
-from dopt.fitting.predictions import predicted
-from dopt.fitting.problem import Simulator
+from dopt.fitting.problem import Simulator, predicted
 from dopt.fitting.simulation import Data
 from orchestrate.program import Parser, answered, integer, path, run, tell
 from studies.real.__main__ import CASES, parts
