@@ -11,8 +11,6 @@ CLAIMS_CONTROL_DB ?= sqlite:///results/claims_control.db
 SMOKE_DB := sqlite:///results/smoke.db
 # The questions that are compared with their history.
 CHECKED := step,evaluation,trial,expansion
-# The policies of which figure 5 shows what their models are good for: all would hide each other.
-CONTROLLED := d_optimal lookahead uniform periodic random random_held
 
 # One thread to a process: the grid runs one worker on each core.
 export OMP_NUM_THREADS := 1
@@ -116,7 +114,6 @@ figures: grid  ## run the paper's grid and draw its figures
 study: run  ## run everything beyond the paper and compare it on one page, report/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=beyond store.url='$(STUDY_DB)'
 	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
-	$(BIN)/python -m analysis figures --db '$(STUDY_DB)' --out report/figures --only figure5_control --env pendulum cartpole arm quadrotor --policy $(CONTROLLED)
 
 claims: run  ## run with other seeds what few leave open, and compare it on two pages, report/claims/ and report/claims_control/
 	$(BIN)/python orchestrate/launch.py -m experiment=claims store.url='$(CLAIMS_DB)'
@@ -128,11 +125,8 @@ smoke: run  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
 	$(BIN)/python -m analysis figures --db '$(SMOKE_DB)' --out figures/smoke
 
-bench: run  ## print measured speed beside its targets, and draw cost against width
+bench: run  ## print measured speed beside its targets
 	$(BIN)/python -m benchmarks
-	$(BIN)/python orchestrate/launch.py -m experiment=width executor=local store.url='$(DB)'
-	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width
-	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width_loss
 
 bench-check: run  ## fail where a step, a trial or the expansion of a grid has become slower
 	$(BIN)/python -m benchmarks --quick --only $(CHECKED) --against benchmarks/history.jsonl

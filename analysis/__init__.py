@@ -6,7 +6,7 @@ CSV beside it. Notebooks begin with :func:`load`. :func:`read_log` reads recorde
 
 from __future__ import annotations
 
-from analysis.data.frames import Results, load
-from analysis.logs.tables import read_log
+from analysis.data.samples import Results, load
+from analysis.log_report import read_log
 
 __all__ = ["Results", "load", "read_log"]

@@ -17,26 +17,25 @@ from typing import Any
 
 import pandas as pd
 
-from analysis import fit_report, report
-from analysis.data.matching import REFERENCE, Filter, read_condition
+from analysis import log_report, report
+from analysis.data.matching import REFERENCE, AnalysisError, Filter, IncompleteError, read_condition
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError, IncompleteError
-from analysis.logs import report as log_report
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread
 from analysis.stats.intervals import BandKind, Statistic
 from analysis.stats.scores import Measure
-from analysis.tables import sample_losses
 from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
+    SAMPLE_LOSS_HELP,
     TABLES,
     TableKind,
     TextTable,
     comparison,
     incomplete,
+    sample_loss_kind,
 )
 from dopt.errors import install_command
 from dopt.process import usable_cores
@@ -107,7 +106,7 @@ def parser() -> Parser:
         commands, "aggregate", _table, "every variant against the reference, over all systems"
     )
     calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP, diverged=False)
-    sampled = _command(commands, "sample-loss", _table, sample_losses.HELP, diverged=False)
+    sampled = _command(commands, "sample-loss", _table, SAMPLE_LOSS_HELP, diverged=False)
     sampled.add_argument("--store", action="store_true", help="keep what is fitted in the database")
     tables = {
         summary: lambda _: TABLES["summary"],
@@ -158,9 +157,9 @@ def parser() -> Parser:
     recorded = commands.add_parser("log", help=log_report.HELP, description=log_report.HELP)
     log_report.add_arguments(recorded)
     recorded.set_defaults(alone=log_report.run)
-    fitted = commands.add_parser("fit", help=fit_report.HELP, description=fit_report.HELP)
-    fit_report.add_arguments(fitted)
-    fitted.set_defaults(alone=fit_report.run)
+    fitted = commands.add_parser("fit", help=log_report.FIT_HELP, description=log_report.FIT_HELP)
+    log_report.add_fit_arguments(fitted)
+    fitted.set_defaults(alone=log_report.run_fit)
     _add_serve(commands)
     return top
 
@@ -307,7 +306,7 @@ def _sampled(options: argparse.Namespace) -> TableKind:
             with Store.open(options.db) as store:
                 store.add_assessments(fitted)
 
-    return sample_losses.sample_loss_kind(lambda text: tell(sys.stderr, f"note: {text}\n"), keep)
+    return sample_loss_kind(lambda text: tell(sys.stderr, f"note: {text}\n"), keep)
 
 
 def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
@@ -335,8 +334,7 @@ def _serve(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
     _check_one_database(options)
     try:
-        from analysis.serve.app import create_app
-        from analysis.serve.server import Server
+        from analysis.serve.app import Server, create_app
     except ModuleNotFoundError as error:
         raise AnalysisError(
             f"The browser needs the library {error.name}: "

@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import pandas as pd
 
+from analysis.data.matching import AnalysisError
 from analysis.data.selection import Selection
-from analysis.errors import AnalysisError
 from analysis.stats.curves import PlotOptions
 from analysis.tables.rendering import TABLES
 from dopt import __version__
@@ -45,14 +45,8 @@ _PLOTS = {
     "figure1_reachable": ("loss_curves", "loss_plot", "reachable_loss"),
     "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
     "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
-    "figure2_spectrum": ("input_spectrum", "spectrum_plot", "cartpole"),
-    "figure4_width": ("width", "COST"),
-    "figure4_width_loss": ("width", "LOSS_AGAINST_WIDTH"),
-    "figure5_control": ("control", "CONTROL"),
+    "figure2_spectrum": ("phase_portraits", "spectrum_plot", "cartpole"),
     "figure6_pareto": ("pareto", "PARETO"),
-    "figure7_profiles": ("profiles", "PROFILES"),
-    "figure8_sensitivity": ("sensitivity", "SENSITIVITY"),
-    "figure9_limits": ("limits", "LIMITS"),
 }
 """Module, name and subject of each figure, in the order of the page."""
 

@@ -123,8 +123,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, wanted: Filter) -> int:
     """Write the page, the pictures, the CSV and the provenance; 0."""
-    from analysis.figures.forest import draw_forest
     from analysis.figures.panels import styled  # Matplotlib: other commands do without it
+    from analysis.figures.reports import draw_forest
 
     with Reader.open(options.db) as reader, reader.moment() as moment:
         found = variant_groups(moment, wanted)

@@ -75,7 +75,7 @@ def _compare(what: str, spec: TrialSpec, rounds: int) -> Row:
 def compile_scan(spec: TrialSpec) -> Callable[[TrialSpec], Any]:
     """Return a function from a trial with one input to its inputs, (T, 1), run as one scan.
 
-    Nothing is evaluated on the way. Letters as in :mod:`dopt.reference.planning`.
+    Nothing is evaluated on the way. Letters as in :mod:`dopt.reference.models`.
     """
     import jax
     import jax.numpy as jnp

@@ -505,7 +505,8 @@ TABLES: dict[str, Callable[[], str]] = {
     )
 }  # fmt: skip
 TABLES |= code_tables.TABLES
-TABLES |= {made.__name__: made for made in (*conclusions.TABLES, *robots.TABLES)}
+MORE = (*conclusions.TABLES, *conclusions.OTHERS, *robots.TABLES)
+TABLES |= {made.__name__: made for made in MORE}
 
 
 def with_tables(text: str) -> str:

@@ -21,6 +21,7 @@ shows the equations, units and defaults of one.
 ``encoder``             how an angle of a plant is measured
 ``Log``                 a recorded run of a plant, in pieces without gaps
 ``fit``                 fit a plant's unknown constants and a network to recorded logs
+``choose``              which recorded segments, or input signals, tell most of a plant
 ``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
@@ -40,6 +41,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dopt.explorer import Explorer as Explorer
+    from dopt.fitting.choice import choose as choose
     from dopt.fitting.fit import fit as fit
     from dopt.learning import LEARNERS as LEARNERS
     from dopt.log import Log as Log
@@ -67,6 +69,7 @@ __all__ = [
     "TrialResult",
     "TrialSpec",
     "__version__",
+    "choose",
     "encoder",
     "fit",
     "fit_offline",
@@ -84,6 +87,7 @@ _MODULES = {
     "SYSTEMS": "dopt.systems",
     "TrialResult": "dopt.result",
     "TrialSpec": "dopt.spec.trial",
+    "choose": "dopt.fitting.choice",
     "encoder": "dopt.systems.plant",
     "fit": "dopt.fitting.fit",
     "fit_offline": "dopt.offline_fit",

@@ -28,9 +28,8 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, random_transitions
-from dopt.models.base import Model
+from dopt.models.base import MLP, Model
 from dopt.models.gaussian_process import GaussianProcess
-from dopt.models.networks import MLP
 from dopt.policies.base import ball_norms, on_sphere
 from dopt.randomness import initial_weights, process_noise, stream
 from dopt.spec.compatibility import Information, held_information

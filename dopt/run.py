@@ -119,7 +119,7 @@ def rerun(spec: TrialSpec, steps: Sequence[int]) -> Rerun:
 
 def _run(spec: TrialSpec) -> Run:
     if spec.config.path == "reference":
-        from dopt.reference.stepper import ReferenceTrial
+        from dopt.reference.batch import ReferenceTrial
 
         return ReferenceTrial(spec)
     from dopt.kernel.run import trial_in_kernel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from orchestrate.program import answered, run
+from orchestrate.program import answered, check_removed, run
 
 if __name__ == "__main__":
     run("orchestrate.__main__")  # what cannot be imported is answered, too
@@ -37,6 +37,7 @@ def overview() -> str:
 def _run(name: str, words: Sequence[str]) -> int:
     commands = {command.name: command for command in COMMANDS}
     if name not in commands:
+        check_removed(f"orchestrate {name}")
         raise unknown_name("command", name, commands)
     command = commands[name]
     return command.run(command.parser().read(words, mixed=True))

@@ -1,12 +1,10 @@
-"""Files and folders that appear whole or not at all, and the error of those that cannot."""
+"""Files that appear whole or not at all, and the error of what cannot be written."""
 
 from __future__ import annotations
 
 import errno
 import os
-import shutil
-import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -76,33 +74,3 @@ def whole(path: Path, argument: str = "--out") -> Iterator[Path]:
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
-
-
-@contextmanager
-def whole_folder(path: Path, is_replaceable: Callable[[Path], bool]) -> Iterator[Path]:
-    """Yield a new folder to write to, beside ``path``; it takes the place of ``path`` at the end.
-
-    After an error there is nothing new at ``path``. Raises ``OutputError``, also if there is
-    something at ``path`` other than an empty folder or one for which ``is_replaceable`` is true.
-    """
-    path = path.absolute()
-    mark = uuid.uuid4().hex  # libraries may remember what they wrote at a path
-    partial, old = (path.with_name(f".{path.name}.{mark}.{kind}") for kind in ("partial", "old"))
-    with writing(path):
-        if path.exists() and not (
-            path.is_dir() and (not any(path.iterdir()) or is_replaceable(path))
-        ):
-            raise OutputError(
-                f"{path} is there already and is no earlier export of this kind, a new or an empty "
-                f"folder is expected: give another one, or remove it."
-            )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            partial.mkdir()
-            yield partial
-            if path.exists():
-                path.rename(old)
-            partial.rename(path)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-            shutil.rmtree(old, ignore_errors=True)

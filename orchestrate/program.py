@@ -6,7 +6,6 @@ Messages of the parser are one sentence with the nearest valid name.
 from __future__ import annotations
 
 import argparse
-import codecs
 import errno
 import functools
 import importlib
@@ -19,7 +18,6 @@ import signal
 import subprocess
 import sys
 import traceback
-import unicodedata
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -41,14 +39,24 @@ _INSTALLED = {
 
 SUCCESSORS = {
     "analysis --figures": "open README.md in the folder of figures",
+    "figure4_width": "python -m studies.speed.width prints the cost of a step",
+    "figure4_width_loss": "python -m analysis summary --group-by width shows the losses",
+    "figure5_control": "python -m analysis report has a table of success and cost of control",
+    "figure7_profiles": "python -m analysis aggregate compares over all systems",
+    "figure8_sensitivity": "python -m analysis summary --group-by learner.window shows each value",
+    "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",
+    "orchestrate vacuum": "sqlite3 FILE VACUUM, or VACUUM in psql, gives the space back",
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
     "--live": "look at the progress of a launch with python -m orchestrate status --watch",
     "launch.live": "look at the progress of a launch with python -m orchestrate status --watch",
     "launch.reference": "compare with python -m analysis compare --reference POLICY",
     "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
     "launch.until='ci<5%'",
-    "export mlflow": "export a bundle, and run studies/trackers/mlflow_runs.py",
-    "export wandb": "export a bundle, and run studies/trackers/wandb_runs.py",
+    "export mlflow": "run studies/trackers/mlflow_runs.py on a SQLite file",
+    "export wandb": "run studies/trackers/wandb_runs.py on a SQLite file",
+    "export npz": "analysis.load() gives matrices and trajectories in Python, for numpy.savez",
+    "export bundle": "copy trials into a file with python -m orchestrate merge OTHER --db "
+    "sqlite:///FILE, or export trials, curves, trajectories and assessments as Parquet",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
@@ -229,12 +237,6 @@ COMMIT_VARIABLE = "DOPT_COMMIT"
 
 LIMITS = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 """Errors of a system that gives no more; it may at another time."""
-
-_ASCII = {
-    **dict(zip("·–—−×∝▁▂▃▄▅▆▇█", "----x~_.:-=+*#", strict=True)),
-    **{"±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "‖": "||", "°": "deg"},
-    "\N{COMBINING DOT ABOVE}": "'",
-}
 
 Parameters = ParamSpec("Parameters")
 
@@ -459,33 +461,10 @@ def _open_streams() -> None:
 
 
 def readable_streams() -> None:
-    """Let letters that a terminal does not know be written in ASCII."""
-    codecs.register_error("readable", _in_ascii)
+    """Let letters that a terminal does not know be written as their codes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="readable")
-
-
-def _in_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Return ``+-`` for ±, ``^2`` for ², ``theta`` for θ; an escape for what has no such form."""
-    assert isinstance(error, UnicodeEncodeError)
-    text, raised = "", False
-    for char in error.object[error.start : error.end]:
-        before, raised = raised, unicodedata.decomposition(char).startswith("<super>")
-        text += ("^" if raised and not before else "") + _plain(char)
-    return text, error.end
-
-
-def _plain(char: str) -> str:
-    if char in _ASCII or char.isascii():
-        return _ASCII.get(char, char)
-    words = unicodedata.name(char, "").split()
-    if words[:1] == ["GREEK"] and "LETTER" in words:
-        return words[-1].capitalize() if "CAPITAL" in words else words[-1].lower()
-    parts = unicodedata.normalize("NFKD", char)
-    if parts != char:
-        return "".join(map(_plain, parts))
-    return "" if unicodedata.combining(char) else ascii(char)[1:-1]
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _tolerate_warnings() -> None:

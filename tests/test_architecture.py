@@ -25,7 +25,7 @@ SAVES = {"orchestrate.runner.saving"}
 
 ONLY_IN = {
     "hydra": ("orchestrate/config/",),
-    "omegaconf": ("orchestrate/config/", "analysis/fit_report.py"),
+    "omegaconf": ("orchestrate/config/", "analysis/log_report.py"),
     "ray": ("orchestrate/executors/ray/",),
     "sqlalchemy": ("orchestrate/store/",),
     "psycopg": ("orchestrate/store/",),
@@ -61,11 +61,9 @@ ORCHESTRATE_IMPORTS = {
     "config": BASE,
     "executors": BASE | {"config", "fingerprint"},
     "store": {"errors", "records", "files"},
-    "queries": BASE | {"store"},
     "runner": BASE | {"config", "executors", "fingerprint", "store"},
-    "export": BASE | {"queries", "store"},
-    "commands": BASE | {"export", "queries", "runner", "store"},
-    "launch": BASE | {"executors"},
+    "commands": BASE | {"runner", "store"},
+    "launch": BASE | {"config", "executors", "runner"},
     "__main__": BASE | {"commands"},
 }
 """Folders and modules of orchestrate that each one may import."""

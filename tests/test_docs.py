@@ -19,8 +19,8 @@ from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate import __main__ as orchestrate
+from orchestrate import launch
 from orchestrate.commands import COMMANDS
-from orchestrate.runner import launch
 from tests.analysis.synthetic import fill, make_grid
 from tests.pages import GENERATED, PAGES, Command, blocks, commands
 from tests.paths import EXAMPLE, ROOT

@@ -11,7 +11,7 @@ import pytest
 
 from analysis import cli
 from orchestrate import __main__ as orchestrate
-from orchestrate.runner import launch
+from orchestrate import launch
 from tests.hydra_files import parse_once
 from tests.paths import ROOT
 

@@ -20,13 +20,21 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from analysis.errors import AnalysisError
-from dopt.errors import SpecificationError
+from dopt.errors import DoptError, SpecificationError
 from dopt.limits import Limits
 from dopt.registry import SOURCE, TARGET
-from dopt.spec.label import flatten
+from dopt.spec.config import flatten
 from dopt.spec.trial import TrialSpec, is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
+
+
+class AnalysisError(DoptError):
+    """The request cannot be answered: unknown name, nothing stored, ambiguous choice."""
+
+
+class IncompleteError(AnalysisError):
+    """Trials that the request needs are missing from the database."""
+
 
 REFERENCE = "d_optimal"
 """The policy that all others are compared with, unless another one is asked for."""

@@ -1,25 +1,45 @@
-"""Numbers of selected trials: curves, rules for diverged ones, bounded states, learned models."""
+"""Numbers of trials: curves, rules for diverged ones, learned models; frames for a notebook.
+
+import analysis
+
+results = analysis.load(env="pendulum")
+results.trials()                       # one row for each trial
+results.curves("loss")                 # one row for each trial and step
+results.matrix("pendulum", "random")   # losses (seed, t)
+results.assessments("control_cost")    # one row for each trial and assessed step
+results.model(trial).predict(states)   # learned accelerations (N, r) of a row of trials()
+"""
 
 from __future__ import annotations
 
+import json
 import reprlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
-from analysis.data.selection import Entry
-from analysis.errors import AnalysisError
+from analysis.data.matching import (
+    AnalysisError,
+    Filter,
+    check_names,
+    choose,
+    latest,
+    read_condition,
+)
+from analysis.data.selection import Entry, environment_rank, policy_rank
 from analysis.style import of_finished
 from dopt.assessment import SAMPLE_LOSS, Plane
 from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
-from orchestrate.store import ConfigRow, Curves, Reader
+from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
+from orchestrate.store.records import stacked
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -232,3 +252,285 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
             f"but a trial that can be simulated again is needed here: choose another one."
         )
     return stored_trial(configuration.config, seed)
+
+
+STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+_MEASURED = ("seed", "t", "measure", "value", "diverged")
+
+
+def read_request(env: object, policy: object, where: object) -> Filter:
+    """Return the filter of a request; raise AnalysisError for arguments of another kind."""
+    return Filter(
+        _names("env", env, "pendulum", "cartpole"),
+        _names("policy", policy, "random", "d_optimal"),
+        {} if where is None else _conditions(where),
+    )
+
+
+def trial_key(trial: object) -> str:
+    """Return the key of a trial that is given as its key or as a row of the table of trials."""
+    if isinstance(trial, str):
+        return trial
+    if isinstance(trial, Mapping | pd.Series):
+        key = trial.get("trial_key")
+        if isinstance(key, str):
+            return key
+    given = f"a table of {len(trial)} rows" if isinstance(trial, pd.DataFrame) else _short(trial)
+    raise AnalysisError(
+        f"The trial is {given}, but one row of results.trials() or a trial key is expected: "
+        f"give for instance results.trials().iloc[0]."
+    )
+
+
+def _names(what: str, given: object, *example: str) -> tuple[str, ...]:
+    if isinstance(given, str):
+        return (given,)
+    names = tuple(given) if isinstance(given, Iterable) else (given,)
+    known = tuple(name for name in names if isinstance(name, str))
+    if len(known) < len(names):
+        one, two = map(json.dumps, example)
+        raise AnalysisError(
+            f"{what} is {_short(given)}, but a name or a list of names is expected: "
+            f"write for instance {what}={one} or {what}=[{one}, {two}]."
+        )
+    return known
+
+
+def _conditions(given: object) -> Mapping[str, object]:
+    if isinstance(given, Mapping) and all(isinstance(path, str) for path in given):
+        return given
+    texts = given if isinstance(given, list) else [given]
+    read = [read_condition(text) for text in texts if isinstance(text, str)]
+    meant = dict(condition for condition in read if condition) or {"model.width": 32}
+    raise AnalysisError(
+        f"where is {_short(given)}, but a mapping of dotted paths to values is expected: "
+        f"write for instance where={meant!r}."
+    )
+
+
+def _short(given: object) -> str:
+    return " ".join(reprlib.repr(given).split())
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """States and inputs of the finished trials of one configuration.
+
+    Attributes
+    ----------
+    seeds : (n,)
+    t : (T + 1,)
+        Time of each state [s].
+    states : (n, T + 1, d)
+        NaN from a divergence on, and after the end of a shorter exploration.
+    inputs : (n, T, m)
+    """
+
+    seeds: npt.NDArray[np.int64]
+    t: npt.NDArray[np.float64]
+    states: npt.NDArray[np.float64]
+    inputs: npt.NDArray[np.float64]
+
+
+def load(
+    db: str | None = None,
+    env: str | Iterable[str] = (),
+    policy: str | Iterable[str] = (),
+    where: Mapping[str, object] | None = None,
+) -> Results:
+    """Open a results database for reading.
+
+    Parameters
+    ----------
+    db
+        URL; by default the variable ``DOPT_DB``, else ``sqlite:///results/results.db``.
+    env, policy
+        Names of environments and policies; none means all.
+    where
+        Values of the configuration by dotted path, such as ``{"model.width": 32}``.
+
+    Raises
+    ------
+    NoDatabaseError, SchemaVersionError
+        If there is nothing to read, or it was written by another version of the program.
+    AnalysisError
+        If ``env``, ``policy`` or ``where`` is of another kind. If a name is not stored or nothing
+        fits, the methods of the results raise it.
+    """
+    url = db or default_url()
+    wanted = read_request(env, policy, where)
+    return Results(Reader.open(url), wanted)
+
+
+class Results:
+    """The configurations of a database that fit a request; a context manager that closes it.
+
+    Every method reads the database again, and so sees what a running launch has finished.
+    """
+
+    def __init__(self, reader: Reader, wanted: Filter) -> None:
+        self.reader = reader
+        self._wanted = wanted
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    def configurations(self) -> pd.DataFrame:
+        """Return one row for each configuration, with the number of its trials by status."""
+        table = pd.DataFrame([asdict(config) for config in self._configs()])
+        return table.set_index("config_key")
+
+    def shown(self) -> pd.DataFrame:
+        """Return the configurations that figures show: one for each environment and policy.
+
+        Rows as in :meth:`configurations`. Raises ``AnalysisError`` where two
+        configurations fit equally well.
+        """
+        chosen = choose(self._configs())
+        return self.configurations().loc[[config.config_key for config in chosen]]
+
+    def trials(self) -> pd.DataFrame:
+        """Return one row for each registered trial: configuration, status, losses, cost, node."""
+        return pd.concat(
+            [
+                _labelled(pd.DataFrame(map(asdict, self.reader.trials(config.config_key))), config)
+                for config in self._configs()
+            ],
+            ignore_index=True,
+        )
+
+    def curves(self, *columns: str) -> pd.DataFrame:
+        """Return one row for each finished trial and step, by default with all columns of a step.
+
+        ``t`` is the step and ``time`` the same in seconds; after a divergence values are NaN.
+        """
+        return pd.concat(
+            [self._tidy(config, columns or STEP_COLUMNS) for config in self._configs()],
+            ignore_index=True,
+        )
+
+    def _tidy(self, config: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
+        with self.reader.moment() as moment:
+            read = {name: moment.curves(config.config_key, name) for name in columns}
+        first = next(iter(read.values()))
+        n, steps = first.values.shape
+        frame = pd.DataFrame(
+            {
+                "seed": np.repeat(first.seeds, steps),
+                "t": np.tile(first.t, n),
+                "time": np.tile(config.dt * first.t, n),
+                "diverged": np.repeat(first.diverged, steps),
+                **{name: column.values.ravel() for name, column in read.items()},
+            }
+        )
+        return _labelled(frame, config)
+
+    def assessments(self, *measures: str) -> pd.DataFrame:
+        """Return one row for each finished trial, measure and number of explored steps ``t``.
+
+        By default of all measures; empty where no trial was assessed. A value that overflowed, or
+        lies past a divergence, is NaN.
+        """
+        parts = [
+            self._measured(config, measure)
+            for config in self._configs()
+            for measure in (measures or self.reader.measures(config.config_key))
+        ]
+        if not parts:
+            return pd.DataFrame(columns=[*CONFIG_COLUMNS, "config_key", *_MEASURED])
+        return pd.concat(parts, ignore_index=True)
+
+    def _measured(self, config: ConfigRow, measure: str) -> pd.DataFrame:
+        found = self.reader.assessments(config.config_key, measure)
+        n, steps = found.values.shape
+        columns = (
+            np.repeat(found.seeds, steps),
+            np.tile(found.t, n),
+            measure,
+            found.values.ravel(),
+            np.repeat(found.diverged, steps),
+        )
+        return _labelled(pd.DataFrame(dict(zip(_MEASURED, columns, strict=True))), config)
+
+    def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
+        """Return one column of the steps of a policy in an environment as a matrix (seed, t).
+
+        Where several configurations fit, the one that figures show is taken.
+        """
+        return self.reader.curves(self._one(env, policy).config_key, column)
+
+    def trajectories(self, env: str, policy: str) -> Trajectories:
+        """Return states and inputs of the finished trials of a policy in an environment."""
+        config = self._one(env, policy)
+        with self.reader.moment() as moment:
+            trials = moment.trials(config.config_key)
+            seeds = [trial.seed for trial in trials if trial.status in ("done", "diverged")]
+            paths = [moment.trajectory(config.config_key, seed) for seed in seeds]
+        if not seeds:
+            raise AnalysisError(f"{env} × {policy} has no finished trial: run the grid first.")
+        return Trajectories(
+            seeds=np.array(seeds, dtype=np.int64),
+            t=config.dt * np.arange(max(len(path.states) for path in paths), dtype=np.float64),
+            states=stacked([path.states for path in paths]),
+            inputs=stacked([path.inputs for path in paths]),
+        )
+
+    def model(self, trial: str | Mapping[str, object] | pd.Series[Any]) -> LearnedModel:
+        """Return the model that a finished trial learned, with ``predict(states, inputs=None)``.
+
+        Parameters
+        ----------
+        trial
+            A row of :meth:`trials`, such as ``results.trials().iloc[0]``, or a trial key.
+
+        Raises
+        ------
+        AnalysisError
+            If it is neither a row nor a key, or no trial of the request has that key.
+        QueryError
+            If the trial is not finished.
+        """
+        key = trial_key(trial)
+        for config in self._configs():
+            for row in self.reader.trials(config.config_key):
+                if row.trial_key == key:
+                    return learned_model(self.reader, config, row.seed)
+        raise AnalysisError(
+            f"No trial of the request has the key '{key}': take one of results.trials()."
+        )
+
+    def _one(self, env: str, policy: str) -> ConfigRow:
+        chosen = choose(config for config in self._configs() if config.env == env)
+        found = [config for config in chosen if config.policy == policy]
+        if not found:
+            have = ", ".join(sorted({f"{c.env} × {c.policy}" for c in self._configs()}))
+            raise AnalysisError(
+                f"No configuration of {env} × {policy} fits the request, stored are {have}: "
+                f"choose one of these."
+            )
+        return found[0]
+
+    def _configs(self) -> list[ConfigRow]:
+        configs = self.reader.configs()
+        check_names("environment", self._wanted.environments, {config.env for config in configs})
+        check_names("policy", self._wanted.policies, {config.policy for config in configs})
+        self._wanted.check_where(configs)
+        accepted = [config for config in configs if self._wanted.accepts(config)]
+        fitting = latest(self.reader, accepted)
+        if not fitting:
+            raise AnalysisError(
+                f"No configuration in {self.reader.safe_url} fits the request, "
+                f"it holds {len(configs)} in all: run the grid first, or ask for less."
+            )
+        return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
+
+
+def _labelled(frame: pd.DataFrame, config: ConfigRow) -> pd.DataFrame:
+    """Put what tells the configuration in front."""
+    for place, name in enumerate(CONFIG_COLUMNS):
+        frame.insert(place, name, getattr(config, name))
+    frame.insert(len(CONFIG_COLUMNS), "config_key", config.config_key)
+    return frame

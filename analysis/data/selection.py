@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from analysis.data.matching import (
     REFERENCE,
+    AnalysisError,
     Filter,
     check_keys,
     check_names,
@@ -21,10 +22,9 @@ from analysis.data.matching import (
     setting_value,
     source_notes,
 )
-from analysis.errors import AnalysisError
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES, TITLES
-from dopt.spec.label import labels, limits_label, value_label
+from dopt.spec.config import labels, limits_label, value_label
 from dopt.spec.trial import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS
 from orchestrate.store import ConfigRow, Reader, TrialRow
@@ -294,8 +294,8 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
 def labelled(entries: Iterable[Entry], group_by: Sequence[str] = ("policy",)) -> list[Entry]:
     """Return entries in the order in which they are drawn, with their labels.
 
-    Labels come from :func:`dopt.spec.label.labels`; grouped by other settings than the policy, from
-    the values.
+    Labels come from :func:`dopt.spec.config.labels`; grouped by other settings than the policy,
+    from the values.
     """
     found = list(entries)
     words = labels_of([entry.config for entry in found])

@@ -37,7 +37,12 @@ from analysis.stats.curves import (
     tabulate_curves,
 )
 from analysis.stats.intervals import FEWEST, BandKind
-from analysis.style import GREY, LineStyle, count_text, environment_title
+from analysis.style import (
+    GREY,
+    LineStyle,
+    count_text,
+    environment_title,
+)
 from dopt.policies import policy_title
 
 PANEL_HEIGHT = 2.3

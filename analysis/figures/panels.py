@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -19,13 +19,11 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.ticker import (
-    FixedLocator,
     FuncFormatter,
     LogLocator,
     MaxNLocator,
     MultipleLocator,
     NullFormatter,
-    NullLocator,
 )
 
 from analysis.data.selection import Selection
@@ -219,13 +217,6 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     axis.set_minor_formatter(NullFormatter())
     if decades < 4:
         axis.set_major_formatter(FuncFormatter(lambda value, _: log_text(value)))
-
-
-def value_ticks(axis: Axis, values: Iterable[float]) -> None:
-    """Set ticks of a logarithmic axis at values, and nowhere else."""
-    axis.set_major_locator(FixedLocator(sorted(values)))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: log_text(value)))
 
 
 def log_text(value: float) -> str:

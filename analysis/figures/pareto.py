@@ -16,7 +16,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 
 from analysis.data.matching import APART
 from analysis.data.samples import DivergenceRule, read_sample
@@ -37,7 +36,6 @@ from analysis.figures.loss_curves import loss_label
 from analysis.figures.panels import (
     GUIDE,
     MARKERS,
-    TEXT_WIDTH,
     Plot,
     half_widths,
     legend_below,
@@ -69,22 +67,8 @@ FEWEST = 2
 
 PANEL_HEIGHT = 3.2
 
-INNER = (TEXT_WIDTH / 2 - 0.6, PANEL_HEIGHT - 0.6)
-"""Least width and height between the axes of a panel, without titles and labels [inches]."""
-
 LEGEND_ROW = 0.16
 LEGEND_COLUMNS = 3
-
-LIST_SIZE = 5.2
-"""Size of the letters in the list of the front [points]."""
-
-LIST_LINE = 1.35 * LIST_SIZE / 72
-"""Height of one of its lines [inches]."""
-
-_HALO = [withStroke(linewidth=1.2, foreground="white")]
-
-LETTER = 0.53 * LIST_SIZE / 72
-"""Usual width of one of its letters [inches]."""
 
 _RULES = {
     DivergenceRule.EXCLUDE: "in none of its numbers",
@@ -316,8 +300,11 @@ def _panel(
     front = [point for point in known if point.on_front]
     for point in known:
         _dot(axes, point, colours[point.policy_words], markers[point.learner_words])
-    _limits(axes, known, front)
-    _front(axes, front)
+    _limits(axes, known)
+    if front:  # as steps
+        times, losses = [one.us for one in front], [one.loss.value for one in front]
+        steps = ([times[0], *times, axes.get_xlim()[1]], [axes.get_ylim()[1], *losses, losses[-1]])
+        axes.plot(*steps, drawstyle="steps-post", color=BLACK, lw=0.7, zorder=2)
     usual = _counts(points).partition(";")[0]
     axes.set_title(f"{environment_title(points[0].env)} ({usual}, {len(points)} configurations)")
     axes.set_xlabel("planning and learning in a step [µs]")
@@ -335,22 +322,13 @@ def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
     )  # fmt: skip
 
 
-def _limits(axes: Axes, known: Sequence[Point], front: Sequence[Point]) -> None:
-    """Set logarithmic axes around all points, with room for the list of the front below it."""
+def _limits(axes: Axes, known: Sequence[Point]) -> None:
+    """Set logarithmic axes around all points, and mark the time between two steps."""
     times = np.array([point.us for point in known])
     ends = [(one.loss.value, one.loss.low, one.loss.high) for one in known]
     left, right = log_limits(times, margin=1.6)
-    low, high = log_limits(np.array(ends).ravel(), margin=1.3)
-    low /= 1.2  # for the number of the lowest point
     log_scale(axes, left, right, "x")
-    width, height = _list_share(front)
-    above = [
-        math.log(min(one.loss.value, one.loss.low))
-        for one in known
-        if math.log(one.us / left) < width * math.log(right / left)
-    ]  # fmt: skip
-    room = [(y - height * math.log(high)) / (1 - height) for y in above]
-    log_scale(axes, math.exp(min([math.log(low), *room])), high)
+    log_scale(axes, *log_limits(np.array(ends).ravel(), margin=1.3))
     limit = known[0].limit_us if known else math.nan
     if left < limit < right:
         axes.axvline(limit, **GUIDE)
@@ -359,52 +337,6 @@ def _limits(axes: Axes, known: Sequence[Point], front: Sequence[Point]) -> None:
             xytext=(-2, -2), textcoords="offset points", rotation=90, ha="right", va="top",
             fontsize=6,
         )  # fmt: skip
-
-
-def _list_share(front: Sequence[Point]) -> tuple[float, float]:
-    """Return the parts of the panel's width and height that the list of the front takes."""
-    longest = max((len(_line(place, one)) for place, one in enumerate(front, 1)), default=0)
-    return min(1.0, LETTER * longest / INNER[0]), LIST_LINE * (len(front) + 1) / INNER[1]
-
-
-def _line(place: int, point: Point) -> str:
-    return f"{place}  {point.label}"
-
-
-def _front(axes: Axes, front: Sequence[Point]) -> None:
-    """Draw the front as steps, number its members and list them in the corner below it."""
-    if not front:
-        return
-    times = [point.us for point in front]
-    losses = [point.loss.value for point in front]
-    steps = ([times[0], *times, axes.get_xlim()[1]], [axes.get_ylim()[1], *losses, losses[-1]])
-    axes.plot(*steps, drawstyle="steps-post", color=BLACK, lw=0.7, zorder=2)
-    for group in _close(axes, front):
-        last = front[group[-1] - 1]
-        axes.annotate(
-            ", ".join(map(str, group)), (last.us, last.loss.value), xytext=(-3, -3),
-            textcoords="offset points", ha="right", va="top", fontsize=LIST_SIZE, weight="bold",
-            zorder=5, path_effects=_HALO,
-        )  # fmt: skip
-    axes.annotate(
-        "\n".join(_line(place, point) for place, point in enumerate(front, 1)), (0, 0),
-        xycoords="axes fraction", xytext=(3, 3), textcoords="offset points", va="bottom",
-        fontsize=LIST_SIZE, linespacing=1.25,
-    )  # fmt: skip
-
-
-def _close(axes: Axes, front: Sequence[Point]) -> list[list[int]]:
-    """Return the numbers of the front, those in one list that would cover each other."""
-    limits = np.log([axes.get_xlim(), axes.get_ylim()])
-    places = np.log([(point.us, point.loss.value) for point in front])
-    inches = (places - limits[:, 0]) / np.diff(limits)[:, 0] * INNER
-    groups: list[list[int]] = []
-    for number in range(1, len(front) + 1):
-        if groups and np.all(np.abs(inches[number - 1] - inches[groups[-1][0] - 1]) < LIST_LINE):
-            groups[-1].append(number)
-        else:
-            groups.append([number])
-    return groups
 
 
 def _handles(
@@ -436,9 +368,7 @@ def caption(numbers: Numbers) -> str:
         f"geometric mean over trials with its 95 % interval (BCa bootstrap, {STUDENT_RANGE} "
         "trials). Time: mean over the steps of a trial, median over trials. Line: Pareto front; "
         "no configuration is both as good and as fast as one on it, and better in one of the two. "
-        "Its members are numbered by their time; a label leaves out what is usual, such as the "
-        "learner adam_window with a network. Dashed, where it is in range: the time between two "
-        "steps, dt. Open markers: some "
+        "Dashed, where it is in range: the time between two steps, dt. Open markers: some "
         f"trials diverged; a diverged trial counts {_RULES[rule]}. {_missing(points)}"
         f"Trials: {counts}."
     )

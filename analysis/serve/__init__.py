@@ -2,7 +2,7 @@
 
 ``app`` has the routes, ``pages`` computes what they show with the functions behind the figures,
 ``sql`` runs statements, ``web`` reads queries, renders answers and holds the database with its
-event stream, and ``server`` checks every request.
+event stream; ``app`` checks every request, too.
 """
 
 from __future__ import annotations

@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import latest
+from analysis.data.matching import AnalysisError, latest
 from analysis.data.samples import DivergenceRule, bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
-from analysis.errors import AnalysisError
 from analysis.serve.web import NotFoundError, QueryParams, ServerState, read_progress, truncated
 from analysis.stats.curves import (
     Axis,
@@ -34,13 +33,11 @@ from analysis.style import policy_style
 from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError
 from dopt.explorer.signs import STORED
-from dopt.spec.config import completed
-from dopt.spec.label import flatten, labels
+from dopt.spec.config import completed, flatten, labels
 from dopt.spec.trial import is_fit, is_prequential, system_of
 from dopt.systems import System
 from dopt.systems.properties import eigenmode
-from orchestrate.store import ConfigRow, LaunchRow, Reader, explorations, failure_kinds
-from orchestrate.store.errors import QueryError
+from orchestrate.store import ConfigRow, LaunchRow, QueryError, Reader, explorations, failure_kinds
 
 Array = npt.NDArray[np.float64]
 Content = dict[str, Any]
@@ -482,7 +479,7 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
 
 
 AHEAD = ("rms", "median", "physics", "linear", "unchanged")
-"""Errors of a fit's predictions (:data:`dopt.fitting.stored.FIT_MEASURES`)."""
+"""Errors of a fit's predictions (:data:`dopt.fitting.export.FIT_MEASURES`)."""
 
 
 def _fit(reader: Reader, trial: Content, config: Content) -> Content | None:

@@ -17,8 +17,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from analysis.serve.web import BusyError, ForbiddenError, QueryParams, ServerState
-from orchestrate.store import READ_VARIABLE, Table
-from orchestrate.store.errors import QueryError
+from orchestrate.store import READ_VARIABLE, QueryError, Table
 
 MAX_ROWS = 1000
 MAX_CSV_ROWS = 100_000

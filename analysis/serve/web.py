@@ -24,13 +24,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response, StreamingResponse
 
-from analysis.data.matching import Filter, read_condition
+from analysis.data.matching import AnalysisError, Filter, read_condition
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError
 from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
-from orchestrate.store.database_url import parse, read_login, safe, sqlite_path
+from orchestrate.store.backends.base import parse_url, public_url, read_login, sqlite_path
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -240,8 +239,8 @@ class Database:
     """Access to the database at a URL, which may be missing, created later or replaced."""
 
     def __init__(self, url: str) -> None:
-        parsed = parse(url)
-        self.safe_url = safe(parsed)
+        parsed = parse_url(url)
+        self.safe_url = public_url(parsed)
         self._url = url
         self.is_file = parsed.get_backend_name() != "postgresql"
         self.user = parsed.username

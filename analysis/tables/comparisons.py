@@ -18,11 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import nearness
+from analysis.data.matching import AnalysisError, nearness
 from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
-from analysis.errors import AnalysisError
-from analysis.stats.control import relative_costs, scores_at
 from analysis.stats.intervals import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
@@ -33,6 +31,8 @@ from analysis.stats.scores import (
     compare_hitting_times,
     final_losses,
     mean_losses,
+    relative_costs,
+    scores_at,
     steps_to,
     without_ratio,
 )

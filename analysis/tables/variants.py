@@ -17,7 +17,14 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import Filter, difference, latest_sources, nearness, newest
+from analysis.data.matching import (
+    AnalysisError,
+    Filter,
+    difference,
+    latest_sources,
+    nearness,
+    newest,
+)
 from analysis.data.samples import DivergenceRule, coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
@@ -29,17 +36,20 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.errors import AnalysisError
-from analysis.stats.control import TrueModel, common_task, measure_control, scores_at, task_of
 from analysis.stats.intervals import mean_columns
 from analysis.stats.scores import (
+    TrueModel,
     benjamini_hochberg,
     censored_median,
+    common_task,
     compare_hitting_times,
     final_losses,
     lasting_steps,
     mcnemar,
     mean_losses,
+    measure_control,
+    scores_at,
+    task_of,
     without_ratio,
 )
 from analysis.tables.comparisons import (

@@ -16,9 +16,8 @@ from dopt.arguments import reals, whole
 from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.flight import InFlight
 from dopt.explorer.signs import SIGNS, STORED
-from dopt.explorer.state import ExplorerState
+from dopt.explorer.state import ExplorerState, InFlight
 from dopt.learning import JointKalman
 from dopt.log import Log
 from dopt.result import Assessment, TrialResult

@@ -18,6 +18,7 @@ import numpy as np
 from dopt.control.planning import predict
 from dopt.explorer.journal import Event
 from dopt.learning import SimulationError
+from dopt.models.gaussian_process import GaussianProcess
 from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
@@ -156,12 +157,14 @@ class Signs:
 
     def _end_block(self, state: Exploration) -> None:
         before, self._parameters = self._parameters, np.array(state.steps.parameters)
-        refitted = isinstance(self._spec.learner, SimulationError)  # which moves them now and then
+        learner, model = self._spec.learner, self._spec.model  # some move them now and then
+        refitted = isinstance(learner, SimulationError)
+        refitted |= isinstance(model, GaussianProcess) and model.is_tuned
         same = before is not None and np.array_equal(before, self._parameters) and not refitted
         self._still = self._still + 1 if same else 0
         if self._still and self._still % (100 // BLOCK) == 0:
             state.counts["unmoved"] += 1
-            self._say("unmoved", self._spec.learner.name)
+            self._say("unmoved", learner.name)
         tested = 0 < (state.done - FIRST) % EVERY <= 2 * TESTED
         if not tested or self._spec.system.n_measured or before is None:
             self._steps = []

@@ -27,14 +27,19 @@ from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of, measured_names
-from dopt.fitting.predictions import (
+from dopt.fitting.problem import (
     HORIZONS,
     Predicted,
+    Simulator,
+    Solution,
+    Windows,
+    first_states,
     linear_predictions,
     predicted,
     prediction_rows,
+    solve,
+    windows_of,
 )
-from dopt.fitting.problem import Simulator, Solution, Windows, first_states, solve, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log
 from dopt.systems.plant import Encoder, Plant, Unknown, first_guess
@@ -118,7 +123,7 @@ def fit(
         If nothing is to be fitted, or the logs do not fit the plant or are too short.
     """
     instance("plant", plant, Plant, "a dopt.Plant")
-    runs, tests = _logs(plant, logs), [] if validate is None else _logs(plant, validate)
+    runs, tests = logs_of(plant, logs), [] if validate is None else logs_of(plant, validate)
     _check(width, weights, workers)
     unknown = [*plant.constants.values(), plant.delay, plant.lag]
     if not (width or any(isinstance(value, Unknown) for value in unknown)):
@@ -126,7 +131,7 @@ def fit(
             "the plant has no unknown constant, delay or lag and the network has no units, but "
             "something to fit is expected: declare one with dopt.unknown(), or give a width."
         )
-    plant = _measuring(plant, runs)
+    plant = measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
     lengths = work.lengths(window)
@@ -221,8 +226,7 @@ class _Selection:
 
     def _latest(self) -> float:
         """Return the longest time from an input to its effect that is tried [s]."""
-        latest = max(self.delay, 0.0) + max(SCANNED) * self.step
-        return latest + 3.0 * first_guess(self.plant.lag)
+        return latest_effect(self.plant, self.delay, self.step)
 
     def scan_delay(self, seconds: float) -> None:
         """Fit the constants to some windows with each delay, and begin from the best one."""
@@ -263,28 +267,9 @@ class _Selection:
                     f"{self.delay + best * self.step:g} s, or a dopt.unknown one"
                 )
         self.model = self._model(self.delay, free=True)
-        self._rescale(found[1], found[2])
+        self.data = rescaled(self.plant, self.data, found[1], found[2])
         p = self.model.extended(found[2].p, found[1])
         self.solution = found[2]._replace(p=p)
-
-    def _rescale(self, model: Model, found: Solution) -> None:
-        """Take the standard deviation of each measured state from what a fit has left."""
-        residuals = Simulator(model, self.data).residuals(found.p, found.windows)
-        floors = [
-            noise.noise
-            if isinstance(noise, Encoder)
-            else 1e-9 * max(float(np.nanstd(column)), 1e-300)
-            for noise, column in zip(
-                (self.plant.measured.get(n, 0.0) for n in measured_names(self.plant)),
-                self.data.measured.T,
-                strict=True,
-            )
-        ]
-        typical = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
-        deviations = self.data.deviations * np.maximum(
-            typical, np.array(floors) / self.data.deviations
-        )
-        self.data = self.data._replace(deviations=deviations)
 
     def choose_window(self, lengths: list[float]) -> None:
         """Fit the constants to windows of each length, and keep the one that predicts best."""
@@ -314,7 +299,8 @@ class _Selection:
         self, width: int, weights: Sequence[float], seed: int
     ) -> tuple[Model, Solution, float] | None:
         """Return the network that predicts best with its weight; None if the constants do."""
-        model = self.model.with_network(width, self._layout(), seed)
+        layout = layout_of(self.model, self.data, self.solution.p, self.solution.windows)
+        model = self.model.with_network(width, layout, seed)
         counts = self.solution.windows.counts(self.data)
         size = float(np.sqrt(np.median(self.solution.squares / counts)))
         start = self.solution._replace(p=model.extended(self.solution.p, self.model))
@@ -340,27 +326,6 @@ class _Selection:
             return None
         self._folds["model"] = (model, folds)
         return model, start, s
-
-    def _layout(self) -> Layout:
-        """Return scales of the network's features and outputs from what was simulated."""
-        simulator, found = Simulator(self.model, self.data), self.solution
-        states = np.concatenate(
-            [
-                simulator.states(found.p, first, last, start)
-                for (first, last), start in zip(*found.windows, strict=True)
-            ]
-        )
-        rows = np.concatenate([np.arange(a, b + 1) for a, b in found.windows.rows])
-        keep = np.isfinite(states).all(axis=1)
-        states, rows = states[keep], rows[keep]
-        flow = self.model.derivative(found.p, states, self.data.inputs[rows])
-        at = self.model.structure.feature_indices
-        linear = self.model.structure.feature_kinds == 0
-        centers = np.where(linear, np.median(states[:, at], axis=0), 0.0)
-        spread = np.quantile(np.abs(states[:, at] - centers), 0.95, axis=0) / 2.0
-        scales = np.where(linear, np.maximum(spread, 1e-300), 1.0)
-        sizes = np.sqrt(np.median(flow[:, self.model.structure.learned] ** 2, axis=0)) / 2.0
-        return Layout(centers, scales, np.maximum(sizes, 1e-300))
 
     def _tested(self, seconds: float, block: int, horizon: float | None = None) -> Integers:
         """Return first row, last row of the history, and last row of held-out predictions."""
@@ -441,6 +406,48 @@ class _Selection:
         return Estimate(model, found, s, 0.5 * (covariance + covariance.T))
 
 
+def latest_effect(plant: Plant, delay: float, step: float) -> float:
+    """Return the longest time from an input to its effect that is tried [s]."""
+    return max(delay, 0.0) + max(SCANNED) * step + 3.0 * first_guess(plant.lag)
+
+
+def rescaled(plant: Plant, data: Data, model: Model, found: Solution) -> Data:
+    """Return data with the standard deviation of each measured state from what a fit has left."""
+    residuals = Simulator(model, data).residuals(found.p, found.windows)
+    floors = [
+        noise.noise if isinstance(noise, Encoder) else 1e-9 * max(float(np.nanstd(column)), 1e-300)
+        for noise, column in zip(
+            (plant.measured.get(n, 0.0) for n in measured_names(plant)),
+            data.measured.T,
+            strict=True,
+        )
+    ]
+    typical = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
+    deviations = data.deviations * np.maximum(typical, np.array(floors) / data.deviations)
+    return data._replace(deviations=deviations)
+
+
+def layout_of(model: Model, data: Data, p: Array, windows: Windows) -> Layout:
+    """Return scales of a network's features and outputs from simulations of windows."""
+    simulator, s = Simulator(model, data), model.structure
+    states = np.concatenate(
+        [
+            simulator.states(p, first, last, start)
+            for (first, last), start in zip(*windows, strict=True)
+        ]
+    )
+    rows = np.concatenate([np.arange(a, b + 1) for a, b in windows.rows])
+    keep = np.isfinite(states).all(axis=1)
+    states, rows = states[keep], rows[keep]
+    flow = model.derivative(p, states, data.inputs[rows])
+    at, linear = s.feature_indices, s.feature_kinds == 0
+    centers = np.where(linear, np.median(states[:, at], axis=0), 0.0)
+    spread = np.quantile(np.abs(states[:, at] - centers), 0.95, axis=0) / 2.0
+    scales = np.where(linear, np.maximum(spread, 1e-300), 1.0)
+    sizes = np.sqrt(np.median(flow[:, s.learned] ** 2, axis=0)) / 2.0
+    return Layout(centers, scales, np.maximum(sizes, 1e-300))
+
+
 def time_scale(data: Data) -> float:
     """Return the shortest period that dominates what is measured [s].
 
@@ -487,14 +494,14 @@ def _blocks(data: Data, runs: Sequence[Log]) -> list[tuple[int, int]]:
     N = len(data.time)
     cuts = np.linspace(0, N, BLOCKS + 1).astype(int)
     if len(runs) >= 3:
-        sizes = [len(data_of_log) for data_of_log in _rows_of_logs(data, runs)]
+        sizes = [len(data_of_log) for data_of_log in rows_of_logs(data, runs)]
         ends = np.cumsum([0, *sizes])
         parts = min(len(runs), BLOCKS + 1)
         cuts = ends[np.linspace(0, len(runs), parts + 1).round().astype(int)]
     return [(int(a), int(b) - 1) for a, b in itertools.pairwise(cuts) if b > a]
 
 
-def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Integers]:
+def rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Integers]:
     pieces = np.split(np.arange(len(data.time)), np.unique(data.firsts)[1:])
     out: list[Integers] = []
     at = 0
@@ -505,7 +512,7 @@ def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Integers]:
     return out
 
 
-def _logs(plant: Plant, given: Any) -> list[Log]:
+def logs_of(plant: Plant, given: Any) -> list[Log]:
     """Return logs of what was given: logs or tables, one or several."""
     several = given if isinstance(given, list | tuple) else [given]
     if not several:
@@ -513,7 +520,7 @@ def _logs(plant: Plant, given: Any) -> list[Log]:
     return [one if isinstance(one, Log) else Log.for_plant(one, plant) for one in several]
 
 
-def _measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
+def measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
     """Return the plant with the states of the logs as measured ones, if it names none."""
     if plant.measured:
         return plant

@@ -13,16 +13,19 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model, data_of, measured_names
-from dopt.fitting.predictions import (
+from dopt.fitting.problem import (
     HORIZONS,
     Predicted,
+    Simulator,
+    Solution,
+    Windows,
     errors_ahead,
+    first_states,
     horizon_errors,
     linear_predictions,
     predicted,
     prediction_rows,
 )
-from dopt.fitting.problem import Simulator, Solution, Windows, first_states
 from dopt.fitting.simulation import Data
 from dopt.log import Log
 from dopt.systems.plant import Plant, Unknown
@@ -347,7 +350,7 @@ class Fitted:
     def store(self, url: str | None = None) -> str:
         """Store the fit as a trial in the results database of the launches.
 
-        Its steps are the rows of the logs, its numbers assessments (:mod:`dopt.fitting.stored`).
+        Its steps are the rows of the logs, its numbers assessments (:mod:`dopt.fitting.export`).
         What is stored of the same fit already is replaced.
 
         Parameters
@@ -368,7 +371,7 @@ class Fitted:
             If the package orchestrate is not installed.
         """
         from dopt.explorer.saving import new_saver
-        from dopt.fitting.stored import FittedTrial
+        from dopt.fitting.export import FittedTrial
 
         trial, saver = FittedTrial(self), new_saver(url)
         try:

@@ -250,7 +250,8 @@ class JointKalman(InformationLearner):
     refit_every : int
         Steps from one fit to the next; with more than a trial has, there is no fit.
     steps : int
-        Gauss-Newton steps of a fit.
+        Gauss-Newton steps of a fit. M belongs to a minimum: with fewer steps intervals are too
+        narrow.
     noise : str
         Whether ρ stays as "given", or is "fitted" too, from ``noise_variance`` on.
     """
@@ -265,7 +266,7 @@ class JointKalman(InformationLearner):
     noise_variance: float = parameter(0.1, bound="positive")
     underweighting: float = parameter(2.0, bound="nonnegative")
     refit_every: int = parameter(100, "steps", "positive")
-    steps: int = parameter(4, "steps", "positive")
+    steps: int = parameter(12, "steps", "positive")
     noise: str = parameter("given", choices=("given", "fitted"), added=True)
 
     @property

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dopt.models.base import Model
+from dopt.models.base import MLP, AffineMLP, BlackBoxMLP, Ensemble, Model
 from dopt.models.gaussian_process import GaussianProcess
 from dopt.models.linear import RFF, GreyBox, Linear, LinearState
-from dopt.models.networks import MLP, AffineMLP, BlackBoxMLP, Ensemble
 
 MODELS: dict[str, type[Model]] = {
     model.name: model

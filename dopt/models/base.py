@@ -1,4 +1,4 @@
-"""Base class of model specifications."""
+"""Base class of model specifications; networks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import KernelSupport
+from dopt.fields import KernelSupport, parameter
 from dopt.systems.base import Feature, System, feature_values, with_inputs
 
 Array = npt.NDArray[np.float64]
@@ -87,3 +87,164 @@ class Model(KernelSupport):
         scales = self.feature_scales(system)
         values = feature_values(self.features(system), scales, np.moveaxis(points, -1, 0))
         return np.stack(values, axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MLP(Model):
+    """Network of ``depth`` hidden layers of ``width`` tanh units and a linear output layer.
+
+    The flat parameter vector is W₁, b₁, W₂, b₂, ... with each W row by row (outputs × inputs), the
+    order of ``torch.nn.utils.parameters_to_vector`` for a stack of ``torch.nn.Linear``.
+
+    Parameters
+    ----------
+    width : int
+        Units in each hidden layer (16 in the paper).
+    depth : int
+        Number of hidden layers (2 in the paper).
+    """
+
+    name: ClassVar[str] = "mlp"
+    compiled: ClassVar[bool] = True
+
+    width: int = parameter(16, "units", "positive")
+    depth: int = parameter(2, "layers", "positive")
+
+    def layer_sizes(self, system: System) -> tuple[int, ...]:
+        """Return the number of units of every layer, from the features to the outputs."""
+        return (self.n_first_inputs(system), *[self.width] * self.depth, system.n_learned)
+
+    def layer_inputs(self, system: System) -> tuple[int, ...]:
+        """Return the number of inputs of every layer, as many as its matrix has columns."""
+        return (*self.layer_sizes(system)[:-2], self.n_output_inputs(system))
+
+    def n_first_inputs(self, system: System) -> int:
+        """Return how many features the first layer has for inputs."""
+        return len(self.features(system))
+
+    def n_output_inputs(self, system: System) -> int:  # noqa: ARG002  # the units of a hidden layer
+        """Return how many inputs the output layer has."""
+        return self.width
+
+    def output_inputs(self, system: System, hidden: Array, features: Array) -> Array:  # noqa: ARG002  # the hidden layer alone
+        """Return the inputs of the output layer for the last hidden layer, (N, w)."""
+        return hidden
+
+    def n_parameters(self, system: System) -> int:
+        n_in, n_out, width = self.n_first_inputs(system), system.n_learned, self.width
+        hidden = (n_in + 1) * width + (self.depth - 1) * (width + 1) * width
+        return hidden + (self.n_output_inputs(system) + 1) * n_out
+
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
+        """Draw every weight and bias of a layer uniformly in ±1/√(units below it)."""
+        return np.concatenate(
+            [
+                rng.uniform(-1.0, 1.0, (n_in + 1) * n_out) / np.sqrt(below)
+                for n_in, below, n_out in self._layers(system)
+            ]
+        )
+
+    def _layers(self, system: System) -> list[tuple[int, int, int]]:
+        """Return for each layer the number of its inputs, of the units below it and of its own."""
+        sizes = self.layer_sizes(system)
+        return list(zip(self.layer_inputs(system), sizes[:-1], sizes[1:], strict=True))
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        features = self.featurize(system, points)
+        values, first = features[:, : self.layer_sizes(system)[0]], 0
+        for layer, (n_in, _, n_out) in enumerate(self._layers(system)):
+            if layer == self.depth:
+                values = self.output_inputs(system, values, features)
+            weights = parameters[first : first + n_in * n_out].reshape(n_out, n_in)
+            first += n_in * n_out
+            values = values @ weights.T + parameters[first : first + n_out]
+            first += n_out
+            if layer < self.depth:
+                values = np.tanh(values)
+        return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlackBoxMLP(MLP):
+    """a_θ(x, u): a network (:class:`dopt.models.MLP`) of the features of x and of u/γ.
+
+    Nothing is assumed of the effect of the inputs.
+    """
+
+    name: ClassVar[str] = "black_box"
+    compiled: ClassVar[bool] = True
+    affine_in_inputs: ClassVar[bool] = False
+
+    def n_inputs_read(self, system: System) -> int:
+        return system.n_inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffineMLP(BlackBoxMLP):
+    """a_θ(x) + B_θ(x) u, with a_θ and the columns of B_θ the outputs of one network of x.
+
+    With h the last hidden layer, the output layer is linear in (h, h u₁/γ, ..., h u_m/γ, u/γ): one
+    matrix W, (r, (1 + m) w + m), and a bias, (r,). In the flat parameter vector they come last, as
+    the last layer of :class:`dopt.models.MLP` does.
+    """
+
+    name: ClassVar[str] = "affine"
+    compiled: ClassVar[bool] = True
+    affine_in_inputs: ClassVar[bool] = True
+
+    def n_first_inputs(self, system: System) -> int:
+        return len(system.features)
+
+    def n_output_inputs(self, system: System) -> int:
+        return (1 + system.n_inputs) * self.width + system.n_inputs
+
+    def output_inputs(self, system: System, hidden: Array, features: Array) -> Array:
+        m = system.n_inputs
+        u = features[:, -m:]
+        products = [hidden * u[:, j : j + 1] for j in range(m)]
+        inputs: Array = np.concatenate([hidden, *products, u], axis=1)
+        return inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ensemble(MLP):
+    """The mean of E networks (:class:`dopt.models.MLP`) with initial parameters of their own.
+
+    The first member is the network of the same seed: it learns at each step and plans are made with
+    it, so that the trial explores as with one network. The others take turns, one learns at each
+    step, so that a step costs two learning steps whatever E is. Losses, predictions and control use
+    the mean of all members, whose errors partly cancel. It goes with a learner that fits all
+    samples again at each step. The parameters are the members' parameters, one after the other.
+    Reference: B. Lakshminarayanan et al., "Simple and scalable predictive uncertainty
+    estimation using deep ensembles" (2017).
+
+    Parameters
+    ----------
+    members : int
+        Number of networks E.
+    """
+
+    name: ClassVar[str] = "ensemble"
+    compiled: ClassVar[bool] = True
+    structure: ClassVar[str] = "ensemble"
+
+    members: int = parameter(5, "networks", "positive")
+
+    @property
+    def n_members(self) -> int:
+        return self.members
+
+    def n_parameters(self, system: System) -> int:
+        return self.members * super().n_parameters(system)
+
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
+        """Draw the parameters of one member after the other, as :class:`dopt.models.MLP` does."""
+        drawn = [super(Ensemble, self).initial_parameters(system, rng) for _ in range(self.members)]
+        return np.concatenate(drawn)
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        """Return the mean of the members' accelerations, (N, r)."""
+        members = parameters.reshape(self.members, -1)
+        values = [super(Ensemble, self).predict_at(system, theta, points) for theta in members]
+        mean: Array = np.mean(values, axis=0)
+        return mean

@@ -22,11 +22,10 @@ from dopt.fields import Validated, default_path, parameter
 from dopt.learning import LEARNERS, Learner
 from dopt.limits import Limits, limits_from
 from dopt.models import MODELS, Model
-from dopt.models.networks import MLP
+from dopt.models.base import MLP
 from dopt.policies import POLICIES, Policy
 from dopt.registry import TARGET, Part, build, check_stored
-from dopt.spec.config import SECTIONS, TrialConfig, without_versions
-from dopt.spec.label import config_label
+from dopt.spec.config import SECTIONS, TrialConfig, config_label, without_versions
 from dopt.systems import System, system_from_mapping
 
 LARGEST_SEED = 2**63 - 1

@@ -20,7 +20,6 @@ COMMANDS: tuple[Command, ...] = (
     maintenance.UPGRADE_COMMAND,
     maintenance.BACKUP_COMMAND,
     maintenance.PRUNE_COMMAND,
-    maintenance.VACUUM_COMMAND,
     design.DESIGN_COMMAND,
 )
 """In the order in which the help shows them."""

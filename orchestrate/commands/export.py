@@ -1,52 +1,341 @@
-"""Command ``export``: results as a file or a folder for other programs, with their origin."""
+"""Command ``export``: results as a file for other programs, with a manifest of their origin."""
 
 from __future__ import annotations
 
 import argparse
-import re
+import hashlib
+import json
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
+
+from dopt import __version__
+from dopt.errors import DoptError
 from orchestrate.commands.command import Command, add_filters, answer, chosen
-from orchestrate.errors import ExitCode
-from orchestrate.export.exporting import FORMATS, KINDS, BundleExport, Export, export
-from orchestrate.program import UsageError, path
-from orchestrate.store import Reader
+from orchestrate.commands.results import counts
+from orchestrate.errors import ExitCode, without_password
+from orchestrate.files import whole
+from orchestrate.program import UsageError, check_removed, path
+from orchestrate.store import ConfigRow, Reader, Trajectory
+from orchestrate.store.records import now, unpack
+from orchestrate.store.schema import OUTCOME_COLUMNS, trial
 
-_NO_LICENSE = "unknown"
-_LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]*")
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+KINDS = ("curves", "trials", "trajectories", "assessments")
+"""Exports that are one file."""
+
+FORMATS = ("csv", "parquet")
+
+_WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id IS NOT NULL"
+
+
+_TEXT, _WHOLE, _REAL = "string", "int64", "double"
+_STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+_SECTIONS = dict.fromkeys(("env", "policy", "model", "learner"), _TEXT)
+_SIZES = {"width": _WHOLE, "depth": _WHOLE}
+_OUTCOME = {
+    name: {int: _WHOLE, float: _REAL, str: _TEXT}[trial.c[name].type.python_type]
+    for name in OUTCOME_COLUMNS
+}
+_STEP = {"seed": _WHOLE, "status": _TEXT, "t": _WHOLE}
+_OF_CONFIG = {"config": _TEXT, **_SECTIONS, **_SIZES}
+"""Columns of the configuration; ``config`` is the beginning of its key."""
+
+Columns = Mapping[str, str]
+"""Kind of each column of a table."""
+
+CURVES: Columns = {**_OF_CONFIG, **_STEP, **dict.fromkeys(_STEP_COLUMNS, _REAL)}
+"""One row for each step."""
+
+TRIALS: Columns = {
+    **{"trial_key": _TEXT, "config_key": _TEXT, **_SECTIONS, **_SIZES},
+    **{"horizon": _WHOLE, "dt": _REAL, "gamma": _REAL},
+    **{"seed": _WHOLE, "status": _TEXT, "attempt": _WHOLE, **_OUTCOME},
+    **{"launch_id": _WHOLE, "error_type": _TEXT, "error_message": _TEXT},
+}
+"""One row for each trial, with or without a result."""
+
+ASSESSMENTS: Columns = {**_OF_CONFIG, **_STEP, "measure": _TEXT, "value": _REAL}
+"""One row for each measure of a trial after t explored steps."""
+
+ROWS = 50_000
+"""Rows of the database in one batch."""
+
+KEY_DIGITS = 12
+
+_CURVES = f"""
+SELECT r.seed, r.status, s.t, {", ".join(f"s.{name}" for name in _STEP_COLUMNS)}
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+JOIN step s ON s.trial_id = r.trial_id
+WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged')
+ORDER BY r.seed, s.t
+"""
+_TRIALS = f"""
+SELECT {", ".join(TRIALS)} FROM v_trial WHERE config_key = :config_key ORDER BY seed
+"""
+_TRAJECTORIES = """
+SELECT r.seed, r.status, j.dtype, j.states_shape, j.states, j.inputs_shape, j.inputs,
+       j.parameters_shape, j.parameters
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+JOIN trajectory j ON j.trial_id = r.trial_id
+WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged')
+ORDER BY r.seed
+"""
+_ASSESSMENTS = """
+SELECT seed, status, t, measure, value FROM v_assessment
+WHERE config_key = :config_key AND status IN ('done', 'diverged') ORDER BY seed, t, measure
+"""
+
+_SELECTED = {
+    "curves": (CURVES, _CURVES),
+    "trials": (TRIALS, _TRIALS),
+    "assessments": (ASSESSMENTS, _ASSESSMENTS),
+}
+"""Columns of a table and the statement for the last of them, of one configuration."""
+
+
+class ExportError(DoptError):
+    """Empty selection, or file that cannot be written."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Request of an export: one of ``KINDS`` in one of ``FORMATS``, with filters."""
+
+    kind: str
+    format: str
+    out: Path
+    filters: Mapping[str, Sequence[str]]
+
+    @property
+    def manifest(self) -> Path:
+        return self.out.with_name(f"{self.out.name}.manifest.json")
+
+
+def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
+    """Write the file, and after it its manifest; return what the manifest says.
+
+    Both appear whole or not at all. ``reader`` sees the moment of ``configs``. Raises
+    ``ExportError``, or ``OutputError`` if they cannot be written.
+    """
+    _expect_trials(reader, configs, wanted)
+    with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
+        content = _write(reader, configs, wanted, out)
+        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": digest(out)}
+        document = {
+            "kind": wanted.kind,
+            "format": wanted.format,
+            **about,
+            **content,
+            **provenance(reader, configs, wanted.filters),
+        }
+        manifest.write_text(json.dumps(document, indent=2) + "\n")
+    return document
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write(
+    reader: Reader, configs: Sequence[ConfigRow], wanted: Export, out: Path
+) -> dict[str, Any]:
+    import pyarrow as pa  # other commands do without it
+
+    if wanted.kind == "trajectories":
+        columns = _trajectory_columns(reader, configs)
+        tables = _trajectories(reader, configs)
+    else:
+        columns, sql = _SELECTED[wanted.kind]
+        tables = _selected(reader, configs, columns, sql)
+    kinds = {name: pa.type_for_alias(kind) for name, kind in columns.items()}
+    write = {"csv": _write_csv, "parquet": _write_parquet}[wanted.format]
+    with closing(tables):  # after an error, before the database
+        rows = write(out, pa.schema(kinds), (_batch(kinds, *one) for one in tables))
+    return {"rows": rows, "columns": {name: str(kind) for name, kind in kinds.items()}}
+
+
+Part = tuple[Mapping[str, Any], int]
+"""Values by column, one for all rows or one for each; number of rows."""
+
+
+def _selected(
+    reader: Reader, configs: Sequence[ConfigRow], columns: Columns, sql: str
+) -> Generator[Part, None, None]:
+    """Yield what a statement returns, by configuration; the other columns are constants."""
+    for config in configs:
+        for rows in reader.batches(ROWS, sql, config_key=config.config_key):
+            names = [*columns][-len(rows[0]) :]
+            values = dict(zip(names, zip(*rows, strict=True), strict=True))
+            yield {**_constants(config), **values}, len(rows)
+
+
+def _trajectory_columns(reader: Reader, configs: Sequence[ConfigRow]) -> Columns:
+    """Return the columns of trajectories: one row for each t from 0 to T, without an input at T."""
+    firsts = [next(_of_config(reader, config, 1), None) for config in configs]
+    n_states = max((one[2].states.shape[1] for one in firsts if one), default=0)
+    n_inputs = max((one[2].inputs.shape[1] for one in firsts if one), default=0)
+    names = [f"state_{i}" for i in range(n_states)] + [f"input_{i}" for i in range(n_inputs)]
+    return {**_OF_CONFIG, **_STEP, **dict.fromkeys(names, _REAL)}
+
+
+def _trajectories(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Part, None, None]:
+    for config in configs:
+        size = max(1, ROWS // (config.horizon + 1))
+        for seed, status, one in _of_config(reader, config, size):
+            n = len(one.states)
+            values = {"seed": seed, "status": status, "t": np.arange(n)}
+            values |= _named("state", one.states, n) | _named("input", one.inputs, n)
+            yield {**_constants(config), **values}, n
+
+
+def _of_config(
+    reader: Reader, config: ConfigRow, size: int
+) -> Iterator[tuple[int, str, Trajectory]]:
+    """Yield (seed, status, trajectory) of a configuration; ``size`` of them are read at a time."""
+    for rows in reader.batches(size, _TRAJECTORIES, config_key=config.config_key):
+        for seed, status, dtype, *packed in rows:
+            arrays = [unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)]
+            yield seed, status, Trajectory(*arrays)
+
+
+def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
+    """Return the columns of an array under their names, with NaN up to n rows."""
+    padded = np.full((n, array.shape[1]), np.nan)
+    padded[: len(array)] = array
+    return {f"{name}_{i}": column for i, column in enumerate(padded.T)}
+
+
+def _constants(config: ConfigRow) -> dict[str, Any]:
+    names = [*_SECTIONS, *_SIZES]
+    key = config.config_key[:KEY_DIGITS]
+    return {"config": key, **{name: getattr(config, name) for name in names}}
+
+
+def _batch(kinds: Mapping[str, pa.DataType], values: Mapping[str, Any], n: int) -> pa.RecordBatch:
+    """Return n rows; a single value fills its column, and what is not finite is missing."""
+    import pyarrow as pa
+
+    def array(value: Any, kind: pa.DataType) -> pa.Array:
+        if isinstance(value, tuple | np.ndarray):
+            return pa.array(value, kind, from_pandas=True)
+        return pa.nulls(n, kind) if value is None else pa.repeat(pa.scalar(value, kind), n)
+
+    arrays = [array(values.get(name), kind) for name, kind in kinds.items()]
+    return pa.RecordBatch.from_arrays(arrays, schema=pa.schema(kinds))
+
+
+def _write_csv(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> int:
+    """Write the rows, missing values empty; return how many."""
+    from pyarrow.csv import CSVWriter
+
+    n = 0
+    with CSVWriter(path, schema) as writer:
+        for batch in batches:
+            writer.write_batch(batch)
+            n += batch.num_rows
+    return n
+
+
+def _write_parquet(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> int:
+    """Write the rows, missing values null; return how many. Many small tables make a slow file."""
+    import pyarrow as pa
+    from pyarrow.parquet import ParquetWriter
+
+    n, waiting = 0, list[pa.RecordBatch]()
+    with ParquetWriter(path, schema, compression="zstd") as writer:
+        for batch in batches:
+            n += batch.num_rows
+            waiting.append(batch)
+            if sum(one.num_rows for one in waiting) >= 4 * ROWS:
+                writer.write_table(pa.Table.from_batches(waiting))
+                waiting = []
+        writer.write_table(pa.Table.from_batches(waiting, schema))
+    return n
+
+
+def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> None:
+    if not configs:
+        raise ExportError(
+            f"{reader.safe_url} holds no trials yet: run a launch that writes to it first."
+        )
+    if wanted.kind == "assessments" and not any(reader.measures(c.config_key) for c in configs):
+        raise ExportError(
+            "No trial of these was assessed, so that there are no assessments to export: run them "
+            "with task=control."
+        )
+    if wanted.kind != "trials" and not any(config.n_done + config.n_diverged for config in configs):
+        raise ExportError(
+            f"No trial of these is done yet, so that there are no {wanted.kind} to export: run "
+            f"the launch, or see status."
+        )
+
+
+def provenance(
+    reader: Reader, configs: Sequence[ConfigRow], filters: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
+    """Return database, selection, configurations and launches, without passwords."""
+    keys = {config.config_key for config in configs}
+    writers = {row.launch_id for row in reader.rows(_WRITERS) if row.config_key in keys}
+    launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
+    return {
+        "written": now(),
+        "program": f"dopt {__version__}",
+        "database": reader.safe_url,
+        "schema_version": reader.schema_version(),
+        "filters": {name: list(values) for name, values in filters.items()},
+        "trials": dict(counts(configs)),
+        "missing_values": "empty in csv, null in parquet: a loss that is not finite",
+        "configs": {config.config_key: dict(config.config) for config in configs},
+        "launches": [_public(launch) for launch in launches],
+    }
+
+
+def _public(launch: Mapping[str, Any]) -> dict[str, Any]:
+    words = {name: [*map(without_password, launch[name])] for name in ("argv", "overrides")}
+    return {**launch, **words}
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "kind",
-        choices=(*KINDS, "bundle"),
-        help="a file: curves (a row for each step), trials (a row for each trial), trajectories "
-        "(states and inputs; with npz also the final parameters) or assessments; a folder: bundle "
-        "(all tables as Parquet, which merge imports into a database)",
+        choices=KINDS,
+        help="curves (a row for each step), trials (a row for each trial), trajectories (states "
+        "and inputs) or assessments",
     )
-    parser.add_argument(
-        "path", nargs="?", type=path("PATH"), metavar="PATH", help="file or folder to write"
-    )
+    parser.add_argument("path", nargs="?", type=path("PATH"), metavar="PATH", help="file to write")
     parser.add_argument("--out", type=path("--out"), metavar="PATH", help="the same, as an option")
     parser.add_argument(
-        "--format", choices=FORMATS, help="csv, parquet or npz (as the name of the file ends)"
-    )
-    parser.add_argument(
-        "--license",
-        metavar="ID",
-        help="licence of the data for the card of a bundle, such as cc-by-4.0 (default: "
-        f"{_NO_LICENSE})",
+        "--format", choices=FORMATS, help="csv or parquet (as the name of the file ends)"
     )
     add_filters(parser)
 
 
 def _run_export(arguments: argparse.Namespace) -> ExitCode:
-    """Write the file and its manifest, or the folder."""
+    """Write the file and its manifest."""
     out = _target(arguments)
-    to = _to_bundle if arguments.kind == "bundle" else _to_file
-    document = to(arguments, out)
-    return answer(arguments, document, _line(arguments.kind, out, document))
+    wanted = Export(
+        kind=arguments.kind,
+        format=arguments.format or _format_of(out),
+        out=out,
+        filters={"env": arguments.env, "policy": arguments.policy},
+    )
+    with Reader.open(arguments.db) as reader, reader.moment() as moment:
+        document = export(moment, chosen(moment, arguments), wanted)
+    size = f"{document['rows']:,} rows, {document['bytes']:,} bytes"
+    line = f"{out}: {size}; from where: {wanted.manifest}"
+    return answer(arguments, document, line)
 
 
 def _target(arguments: argparse.Namespace) -> Path:
@@ -60,54 +349,10 @@ def _target(arguments: argparse.Namespace) -> Path:
     return out
 
 
-def _to_file(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
-    if arguments.license is not None:
-        raise UsageError("--license is for the card of a bundle, not for a file: leave it out.")
-    wanted = Export(
-        kind=arguments.kind,
-        format=arguments.format or _format_of(out),
-        out=out,
-        filters={"env": arguments.env, "policy": arguments.policy},
-    )
-    with Reader.open(arguments.db) as reader, reader.moment() as moment:
-        return export(moment, chosen(moment, arguments), wanted)
-
-
-def _to_bundle(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
-    from orchestrate.export.bundle import write_bundle  # Arrow would slow every command
-
-    if arguments.format is not None:
-        raise UsageError("--format is for files, but a bundle is a folder: leave it out.")
-    wanted = BundleExport(
-        out=out,
-        filters={"env": arguments.env, "policy": arguments.policy},
-        license=_license(arguments),
-    )
-    with Reader.open(arguments.db) as reader, reader.moment() as moment:
-        return write_bundle(moment, chosen(moment, arguments), wanted)
-
-
-def _license(arguments: argparse.Namespace) -> str:
-    given = arguments.license
-    if given is not None and not _LICENSE.fullmatch(given):
-        raise UsageError(
-            f"--license is {given!r}, an identifier in lower case is expected: give one such as "
-            f"cc-by-4.0 or mit."
-        )
-    return given or _NO_LICENSE
-
-
-def _line(kind: str, out: Path, document: dict[str, Any]) -> str:
-    if kind == "bundle":
-        return f"{out}: {document['n_trials']:,} trials, {document['bytes']:,} bytes"
-    size = f"{document['rows']:,} rows" if "rows" in document else "matrices"
-    manifest = out.with_name(f"{out.name}.manifest.json")
-    return f"{out}: {size}, {document['bytes']:,} bytes; from where: {manifest}"
-
-
 def _format_of(path: Path) -> str:
     ending = path.suffix.removeprefix(".").lower()
     if ending not in FORMATS:
+        check_removed(f"export {ending}")
         raise UsageError(
             f"The name of {path} does not say its format, {', '.join(FORMATS)} are known: give "
             f"--format or such an ending."
@@ -115,6 +360,4 @@ def _format_of(path: Path) -> str:
     return ending
 
 
-EXPORT_COMMAND = Command(
-    "export", "write results to a file or a bundle", _run_export, _add_export_arguments
-)
+EXPORT_COMMAND = Command("export", "write results to a file", _run_export, _add_export_arguments)

@@ -1,4 +1,4 @@
-"""Commands that check or change a whole database, from ``merge`` to ``vacuum``."""
+"""Commands that check or change a whole database, from ``merge`` to ``prune``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from datetime import UTC, datetime, timedelta
 
 from dopt.errors import given_path
 from orchestrate.commands.command import (
-    PROGRAM,
     Command,
     add_filters,
     answer,
@@ -25,10 +24,16 @@ from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, length_of_time, path
 from orchestrate.store import RETRIED, Reader, Store
 from orchestrate.store.doctor import Finding, examine
-from orchestrate.store.maintenance import Prunable, back_up, merge_collected, prunable, vacuum
+from orchestrate.store.maintenance import (
+    Prunable,
+    Upgrade,
+    back_up,
+    merge_collected,
+    prunable,
+    upgrade,
+)
 from orchestrate.store.merge import Merged, TrialName, merge
 from orchestrate.store.records import utc_text
-from orchestrate.store.upgrade import Upgrade, upgrade
 
 MAX_LISTED = 10
 """Trials of a kind that are listed; the JSON has all of them."""
@@ -38,7 +43,7 @@ def _add_merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "other",
         metavar="OTHER",
-        help="file or URL of the other database, or folder of a bundle or of shards",
+        help="file or URL of the other database, or folder of shards",
     )
 
 
@@ -57,10 +62,6 @@ def _merge(url: str, other: str) -> Merged:
     place = given_path(other, "OTHER", UsageError)
     if not place.is_dir():
         return merge(url, f"sqlite:///{place.absolute()}", trial_key)
-    if not any(place.glob("*.db")):  # a bundle has other files
-        from orchestrate.store.bundle import merge_bundle
-
-        return merge_bundle(url, place, trial_key)
     total = Merged()
     for merged in merge_collected(url, place, trial_key=trial_key):
         total.include(merged)
@@ -299,18 +300,7 @@ def _prune_sentence(found: Prunable, deleted: int, *, dry: bool) -> str:
     if dry:
         trials = f"{len(found.keys):,} trials would be deleted ({kinds})"
         return f"{trials}: {size}; nothing was changed.{rest}"
-    space = f"{PROGRAM} vacuum gives the space back"
-    return f"{deleted:,} trials were deleted ({kinds}): {size}; {space}.{rest}"
+    return f"{deleted:,} trials were deleted ({kinds}): {size}.{rest}"
 
 
 PRUNE_COMMAND = Command("prune", "delete old or unwanted trials", _run_prune, _add_prune_arguments)
-
-
-def _run_vacuum(arguments: argparse.Namespace) -> ExitCode:
-    """Vacuum the database and print its size before and after."""
-    done = vacuum(arguments.db)
-    sizes = f"{done.before:,} bytes before, {done.after:,} bytes now"
-    return answer(arguments, asdict(done), f"{done.safe_url}: {sizes}")
-
-
-VACUUM_COMMAND = Command("vacuum", "give the space of deleted rows back", _run_vacuum)

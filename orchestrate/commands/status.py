@@ -25,11 +25,10 @@ from orchestrate.commands.command import (
     say_json,
     show,
 )
-from orchestrate.commands.results import grid_table
+from orchestrate.commands.results import STATES, Status, gather, grid_table, seconds_since
 from orchestrate.errors import ExitCode, without_password
 from orchestrate.program import as_started, length_of_time, positive, tell
 from orchestrate.program import say as say_still
-from orchestrate.queries import STATES, Status, gather, seconds_since
 from orchestrate.runner.progress import duration
 from orchestrate.store import ExplorationRow, FailureKind, LaunchRow, Reader, StoreUnavailableError
 

@@ -25,8 +25,13 @@ from omegaconf.errors import OmegaConfBaseException
 from dopt.errors import SpecificationError
 from orchestrate.config import TRIAL_SECTIONS, Combination
 from orchestrate.config.expand import expand, reject_unknown
-from orchestrate.config.options import CONFIGURATION, content_of, option_names, register
-from orchestrate.config.sweeps import parsed_overrides
+from orchestrate.config.options import (
+    CONFIGURATION,
+    content_of,
+    option_names,
+    parsed_overrides,
+    register,
+)
 from orchestrate.program import Parser, UsageError, as_started, check_removed
 
 PROGRAM = "python orchestrate/launch.py"

@@ -2,7 +2,7 @@
 
 :func:`hydra.compose` composes the configuration of each choice of groups; scalar sweeps are a
 product over its plain values. The result equals what Hydra's basic sweeper gives wherever that one
-succeeds, except for the values of some sweeps (:mod:`orchestrate.config.sweeps`).
+succeeds, except for the values of some sweeps (:mod:`orchestrate.config.options`).
 
 The basic sweeper fails if an override sets a key that only some of the choices have, such as
 ``policy.regularization=1e-2`` with every policy. Here the override applies to the choices that have
@@ -30,8 +30,14 @@ from omegaconf.errors import OmegaConfBaseException
 from dopt.errors import unknown_name
 from dopt.registry import TARGET
 from orchestrate.config import TRIAL_SECTIONS, Combination
-from orchestrate.config.options import KNOWN, unknown_field, unknown_setting
-from orchestrate.config.sweeps import Axis, parsed_overrides, read_axes
+from orchestrate.config.options import (
+    KNOWN,
+    Axis,
+    parsed_overrides,
+    read_axes,
+    unknown_field,
+    unknown_setting,
+)
 
 Settings = dict[str, Any]
 Check = Callable[[DictConfig], None]
@@ -70,7 +76,7 @@ def expand(
     settings
         Hydra's own settings in the configuration of the launch; Hydra has to be initialized.
     grids
-        Overrides that span each grid (:func:`orchestrate.config.sweeps.read_axes`).
+        Overrides that span each grid (:func:`orchestrate.config.options.read_axes`).
     sections
         Top-level keys that the settings of a combination hold.
     grouped

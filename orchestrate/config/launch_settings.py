@@ -147,7 +147,7 @@ class LaunchSettings:
     Attributes
     ----------
     executor
-        Name in :data:`orchestrate.executors.registry.EXECUTORS`.
+        Name in :data:`orchestrate.executors.base.EXECUTORS`.
     store_url
         SQLAlchemy URL of the results database.
     detach

@@ -1,8 +1,12 @@
-"""Options of the groups of a launch, and error messages with the nearest valid one.
+"""Options of the groups of a launch, axes of a grid, and error messages with the nearest option.
 
 A file holds the paper's systems and policies with the reasons for their numbers, and whatever
 chooses more than one part. Every other system and policy is an option with the defaults of its
 class, whose docstring gives units and reasons: ``env=beyond/chain``, ``policy=baseline/prbs``.
+
+A grid has an axis for each override. Its values are what the words say, also where stock Hydra has
+others: of a sorted range, the nearest decimals of a range of real numbers, and the same order each
+time of a shuffled sweep.
 """
 
 from __future__ import annotations
@@ -10,13 +14,31 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from fractions import Fraction
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import (
+    ChoiceSweep,
+    Glob,
+    Override,
+    OverrideType,
+    Quote,
+    QuotedString,
+    RangeSweep,
+    Sweep,
+    Transformer,
+)
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -26,9 +48,292 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from dopt.errors import DoptError, SpecificationError, unknown_name
+from dopt.errors import DoptError, SpecificationError, suggestion, unknown_name
 from dopt.registry import TARGET, imported
 from orchestrate.program import removed_word
+
+NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
+"""Groups and sections of the whole launch, which cannot be swept."""
+
+MAX_VALUES = 1_000_000
+"""Largest number of values of one sweep, so that a mistyped range does not fill the memory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """Key of an override and its values.
+
+    Attributes
+    ----------
+    key
+        Configuration key or group as typed, with its prefix ``+``, ``++`` or ``~`` and its package.
+    texts
+        The values as Hydra would write them after the equals sign.
+    values
+        The values, typed by Hydra's grammar.
+    kind
+        ``choice`` of a group, ``scalar`` that replaces a value, or ``edit``: any other change of
+        the composed configuration, such as ``+k=1``, a list or a deletion.
+    place
+        Number of the override in its order.
+    """
+
+    key: str
+    texts: tuple[str, ...]
+    values: tuple[object, ...]
+    kind: Literal["choice", "scalar", "edit"]
+    place: int = 0
+
+    @property
+    def swept(self) -> bool:
+        return len(self.texts) > 1
+
+    @property
+    def replaces(self) -> bool:
+        """Whether the override sets an existing key: not a group, and without ``+`` or ``~``."""
+        return self.kind != "choice" and self.key[0] not in "+~"
+
+    def argument(self, index: int) -> str:
+        """Return the override that sets value ``index``."""
+        return f"{self.key}={self.texts[index]}"
+
+
+def read_axes(loader: ConfigLoader, arguments: Sequence[str]) -> list[Axis]:
+    """Return the axes that the overrides span.
+
+    A later override of a key replaces earlier ones, but mappings are merged, as in a single trial.
+
+    Raises
+    ------
+    HydraException
+        If an override does not follow Hydra's grammar, or its sweep is empty or endless.
+    SpecificationError
+        If a glob matches nothing.
+    """
+    kept: list[Override] = []
+    for one in parsed_overrides(arguments, loader):
+        key = one.get_key_element()
+        merged = _is_mapping(one)
+        kept = [k for k in kept if k.get_key_element() != key or (merged and _is_mapping(k))]
+        kept.append(one)
+    axes = [dataclasses.replace(_axis(loader, one), place=i) for i, one in enumerate(kept)]
+    return [_without_clash(axis, axes) for axis in axes]
+
+
+def parsed_overrides(
+    arguments: Sequence[str], loader: ConfigLoader | None = None
+) -> list[Override]:
+    """Return overrides by Hydra's grammar.
+
+    Raises
+    ------
+    HydraException
+        If one does not follow it, shuffles a list, or has a sweep within a list or a mapping.
+    """
+    parser = OverridesParser.create(config_loader=loader)
+    named = parser.functions.functions
+    named["sort"] = partial(_sorted, named["sort"])
+    named["shuffle"] = partial(_unshuffled, named["shuffle"])
+    parsed = parser.parse_overrides(list(arguments))
+    for one in parsed:
+        if not isinstance(one._value, Sweep) and _holds_sweep(one._value):
+            raise ConfigCompositionException(
+                f"'{one.input_line}' has a sweep within a list or a mapping, but a sweep of whole "
+                "values is expected: write each list or mapping, with commas between them."
+            )
+    return parsed
+
+
+def _sorted(
+    sort: Callable[..., Any],
+    *args: Any,
+    sweep: Any = None,
+    reverse: bool = False,
+    **named: Any,
+) -> Any:
+    """Sort as Hydra's ``sort``, except for a range, which Hydra turns into another range."""
+    ranges = [one for one in (*args, sweep) if isinstance(one, RangeSweep)]
+    if ranges:
+        return ChoiceSweep(list=[*sorted(_range_values(ranges[0]), reverse=reverse)])
+    return sort(*args, sweep=sweep, reverse=reverse, **named)
+
+
+def _unshuffled(shuffle: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    """Keep the order of a sweep, on which no result depends; refuse to shuffle a list."""
+    shuffled = shuffle(*args, **named)
+    if not isinstance(shuffled, Sweep):
+        raise ValueError("a shuffled list is another value each time: write it in its order")
+    shuffled.shuffle = False  # type: ignore[attr-defined]  # every sweep here has it
+    return shuffled
+
+
+def _holds_sweep(value: object) -> bool:
+    parts = [*value.values()] if isinstance(value, Mapping) else value
+    return isinstance(value, Sweep) or (isinstance(parts, list) and any(map(_holds_sweep, parts)))
+
+
+def _is_mapping(override: Override) -> bool:
+    values = _values(override._value)
+    return override.type != OverrideType.DEL and all(isinstance(one, dict) for one in values)
+
+
+def _values(value: object) -> list[Any]:
+    """Return the values of a sweep of choices and ranges, or the one that is given."""
+    if isinstance(value, ChoiceSweep):
+        return [one for part in value.list for one in _values(part)]
+    return _range_values(value) if isinstance(value, RangeSweep) else [value]
+
+
+def _range_values(sweep: RangeSweep) -> list[int] | list[float]:
+    """Return start + k · step before stop: whole numbers, or the nearest decimals."""
+    bounds = sweep.start, sweep.stop, sweep.step
+    given = f"range({','.join(map(str, bounds))})"
+    try:
+        start, stop, step = (Fraction(repr(bound)) for bound in bounds)
+        count = math.ceil((stop - start) / step)
+    except (ValueError, ZeroDivisionError) as error:
+        raise ConfigCompositionException(
+            f"{given} has no finite list of values: give finite numbers, and a step other than 0."
+        ) from error
+    if count > MAX_VALUES:
+        raise ConfigCompositionException(
+            f"{given} has more than {MAX_VALUES:,} values: check its bounds, or sweep in parts."
+        )
+    values = [start + k * step for k in range(count)]
+    whole = all(isinstance(bound, int) for bound in bounds)
+    return [int(value) for value in values] if whole else [float(value) for value in values]
+
+
+def _axis(loader: ConfigLoader, override: Override) -> Axis:
+    key = override.get_key_element()
+    texts: tuple[str, ...]
+    values: tuple[object, ...]
+    value: object = override.value()
+    if not override.is_sweep_override():
+        texts, values = (override.get_value_element_as_str(),), (value,)
+    elif isinstance(value, Glob):
+        _check_key(override)
+        texts = values = _matches(loader, override.key_or_group, value)
+        if not texts:
+            raise _no_match(loader, override, value)
+    else:
+        _check_key(override)
+        found = _swept_values(override)
+        texts = tuple(map(_text, found))
+        values = tuple(map(_unquoted, found))
+    options = loader.get_group_options(override.key_or_group, results_filter=None)
+    if options and not any(isinstance(value, dict) for value in values):
+        if None in values:
+            raise unknown_name(override.key_or_group, "null", options)
+        return Axis(key, texts, values, "choice")
+    scalar = override.type == OverrideType.CHANGE and override.package is None
+    return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
+
+
+def _check_key(override: Override) -> None:
+    if override.key_or_group.replace("/", ".").split(".")[0] in NOT_SWEPT:
+        raise ConfigCompositionException(
+            f"'{override.input_line}' sweeps a setting of the launch, but only settings of trials "
+            "can be swept: give one value."
+        )
+
+
+def _swept_values(override: Override) -> list[Any]:
+    line, found = override.input_line, _values(override._value)
+    if any(isinstance(one, Sweep) for one in found):
+        raise ConfigCompositionException(
+            f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
+        )
+    if not found:
+        raise ConfigCompositionException(
+            f"'{line}' has no values, at least one is expected: check its bounds."
+        )
+    return found
+
+
+def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception:
+    key = override.key_or_group
+    if options := _every_option(loader, key):
+        pattern = ",".join(glob.include)
+        hint = suggestion(pattern, sorted(options))
+        return SpecificationError(f"no name of {key} matches the pattern '{pattern}': {hint}")
+    names = sorted(name for name in loader.list_groups("") if name != "hydra")
+    return ConfigCompositionException(
+        f"'{override.input_line}' is a glob, but '{key}' is not a group: groups are "
+        f"{', '.join(names)}."
+    )
+
+
+def _matches(loader: ConfigLoader, group: str, glob: Glob) -> tuple[str, ...]:
+    """Return the options that a glob matches, folder by folder in the order of its patterns.
+
+    As in Hydra, a pattern without a folder matches options of the group itself, not those in its
+    folders; ``beyond/*`` matches those in the folder ``beyond``.
+    """
+    folders = dict.fromkeys(_folder(pattern) for pattern in glob.include)
+    names = [name for folder in folders for name in _options(loader, group, folder)]
+    return tuple(
+        name for name in names if _any(name, glob.include) and not _any(name, glob.exclude)
+    )
+
+
+def _every_option(loader: ConfigLoader, group: str) -> list[str]:
+    """Return the options of a group and of its folders."""
+    folders = loader.get_group_options(group, results_filter=ObjectType.GROUP)
+    return [name for folder in ("", *folders) for name in _options(loader, group, folder)]
+
+
+def _options(loader: ConfigLoader, group: str, folder: str) -> list[str]:
+    path = f"{group}/{folder}" if folder else group
+    found = loader.get_group_options(path, results_filter=ObjectType.CONFIG)
+    return [f"{folder}/{option}" if folder else option for option in found]
+
+
+def _any(name: str, patterns: list[str]) -> bool:
+    return any(
+        _folder(name) == _folder(pattern) and fnmatchcase(name, pattern) for pattern in patterns
+    )
+
+
+def _folder(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _text(value: Any) -> str:
+    """Return a value as an override has it; a text that would be read as a number is quoted."""
+    text = Transformer.str(value)
+    if isinstance(value, str) and parsed_overrides([f"k={text}"])[0].value() != value:
+        return QuotedString(value, Quote.single).with_quotes()
+    return text
+
+
+def _unquoted(value: object) -> object:
+    return value.text if isinstance(value, QuotedString) else value
+
+
+def _plain(value: object) -> bool:
+    """Return whether ``value`` is a plain value, with no interpolation."""
+    if isinstance(value, str):
+        return "${" not in value and value != "???"
+    return value is None or isinstance(value, bool | int | float)
+
+
+def _without_clash(axis: Axis, axes: Sequence[Axis]) -> Axis:
+    """Turn a scalar into an edit if another override changes the same part of the tree."""
+    edits = (other for other in axes if other is not axis and other.kind != "choice")
+    if axis.kind == "scalar" and any(_overlap(axis.key, other.key) for other in edits):
+        return dataclasses.replace(axis, kind="edit")
+    return axis
+
+
+def _overlap(one: str, other: str) -> bool:
+    pairs = zip(_path(one), _path(other), strict=False)
+    return all(a == b for a, b in pairs)
+
+
+def _path(key: str) -> list[str]:
+    return key.lstrip("+~").split("@")[0].split(".")
+
 
 CONFIGURATION = Path(__file__).resolve().parents[1] / "conf"
 

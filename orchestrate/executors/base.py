@@ -1,4 +1,7 @@
-"""Interface of executors: chunks of tasks are submitted, outcomes are returned as tasks end.
+"""Interface of executors, the registry that names them, and the one in this process.
+
+Chunks of tasks are submitted, and outcomes are returned as tasks end. A new executor is a module
+with a ``FACTORY``, its file ``conf/executor/NAME.yaml``, and its name in :data:`EXECUTORS`.
 
 An executor knows neither the database nor Hydra. It never repeats a task: it reports lost tasks,
 and the scheduler decides whether they run again.
@@ -12,14 +15,17 @@ import socket
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Self
+from importlib import import_module
+from typing import Protocol, Self
 
-from dopt.errors import UnusableEnvironmentError
+from dopt.errors import UnusableEnvironmentError, unknown_name
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 
@@ -198,3 +204,153 @@ def _checked(result: object) -> TrialResult:
         f"The trial returned {type(result).__name__}, but a TrialResult is expected: correct the "
         "function that ran it."
     )
+
+
+EXECUTORS: Mapping[str, str] = {
+    "inprocess": __name__,
+    **{name: f"orchestrate.executors.{name}" for name in ("local", "lockstep", "ray", "slurm")},
+}
+"""Module of each executor in ``conf/executor/``, imported when a launch names it."""
+
+
+def _accept(_: LaunchSettings) -> None:
+    """Accept all settings."""
+
+
+class Job(Protocol):
+    """Job of a batch system, in which workers take the trials from the database."""
+
+    def text(self, trials: int) -> str:
+        """Return the script that is submitted for a grid with so many trials to run."""
+        ...
+
+    def submit(self, trials: int, environment: Mapping[str, str]) -> str:
+        """Submit the job, whose workers get the variables, and return a sentence about it.
+
+        Raises
+        ------
+        LaunchError, InfrastructureError
+            If the batch system refuses the job, or cannot be reached.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ExecutorFactory:
+    """Constructor of an executor, and the facts that a launch needs before it starts one.
+
+    Attributes
+    ----------
+    make
+        Returns the executor for the settings, not yet started. The last argument has been called
+        on this machine; machines of a cluster call it before their first trial. None where a job
+        runs the trials.
+    trials_at_once
+        Number of trials that hold memory of this machine at the same time; None where they use
+        other memory.
+    check
+        Raises ``LaunchError`` for settings that cannot work here, before any trial is registered.
+    path
+        Execution path of the trials, "kernel" or "reference".
+    in_process
+        Whether trials run in the process of the launch; a single trial then uses this executor.
+    limiting_key
+        Key that reduces ``trials_at_once``.
+    job
+        Returns the job that runs the grid after the launch has left, or raises ``LaunchError``.
+    """
+
+    make: Callable[[LaunchSettings, Run, Prepare | None], Executor] | None
+    trials_at_once: Callable[[LaunchSettings], int | None]
+    check: Callable[[LaunchSettings], None] = _accept
+    path: str = "kernel"
+    in_process: bool = False
+    limiting_key: str = "launch.workers"
+    job: Callable[[LaunchSettings], Job] | None = None
+
+
+def limits_of(settings: LaunchSettings) -> Limits:
+    """Return the limits of one trial."""
+    return Limits(settings.timeout, settings.memory_gib)
+
+
+def executor_factory(settings: LaunchSettings) -> ExecutorFactory:
+    """Return the factory of the executor that the settings name.
+
+    Raises
+    ------
+    SpecificationError
+        For an unknown name, with the nearest valid one.
+    """
+    if settings.executor not in EXECUTORS:
+        raise unknown_name("executor.name", settings.executor, EXECUTORS)
+    factory: ExecutorFactory = import_module(EXECUTORS[settings.executor]).FACTORY
+    return factory
+
+
+def make_executor(settings: LaunchSettings, run: Run, prepare: Prepare | None = None) -> Executor:
+    """Return the executor that the settings name, not yet started."""
+    make = executor_factory(settings).make
+    assert make is not None, f"a job runs the trials of executor={settings.executor}"
+    return make(settings, run, prepare)
+
+
+def make_job(settings: LaunchSettings) -> Job | None:
+    """Return the job that a launch submits before it leaves, or None where it submits none.
+
+    Raises
+    ------
+    LaunchError
+        For wrong settings of the job.
+    """
+    make = executor_factory(settings).job
+    return None if make is None or settings.detach else make(settings)
+
+
+class QueueExecutor(Executor):
+    """Queue of chunks that run in this process, in calls of ``wait``."""
+
+    def __init__(self) -> None:
+        self._chunks: deque[deque[Task]] = deque()
+
+    def start(self) -> None:
+        self.slots = 1
+
+    def submit(self, chunk: Sequence[Task]) -> None:
+        if chunk:
+            self._chunks.append(deque(chunk))
+
+    @property
+    def pending(self) -> int:
+        return len(self._chunks)
+
+    def stop(self) -> None:
+        self._chunks.clear()
+
+
+class InProcessExecutor(QueueExecutor):
+    """Runs one task at each call of ``wait``.
+
+    A time limit cannot stop native code that does not return to the interpreter. The memory limit
+    is not set, because it would hold for the whole launch.
+    """
+
+    def __init__(self, run: Run, limits: Limits = NO_LIMITS) -> None:
+        super().__init__()
+        self._run = run
+        self._limits = limits
+
+    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running trial is not left
+        if not self._chunks:
+            return []
+        event = run_task(self._run, self._chunks[0].popleft(), self._limits)
+        if not self._chunks[0]:
+            self._chunks.popleft()
+        return [event]
+
+
+FACTORY = ExecutorFactory(
+    make=lambda settings, run, _: InProcessExecutor(run, limits_of(settings)),
+    trials_at_once=lambda _: 1,
+    in_process=True,
+)

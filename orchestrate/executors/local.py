@@ -21,9 +21,17 @@ from signal import SIGKILL
 from dopt.errors import DoptError
 from dopt.process import usable_cores
 from orchestrate.errors import InfrastructureError, LaunchError
-from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
+from orchestrate.executors.base import (
+    Event,
+    Executor,
+    ExecutorFactory,
+    Run,
+    Task,
+    TaskDone,
+    WorkerLost,
+    limits_of,
+)
 from orchestrate.executors.limits import NO_LIMITS, ONE_THREAD, Limits, module_path
-from orchestrate.executors.registry import ExecutorFactory, limits_of
 from orchestrate.program import LIMITS, hiding
 
 PREFETCHED_CHUNKS = 2

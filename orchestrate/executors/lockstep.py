@@ -14,9 +14,15 @@ from datetime import UTC, datetime
 from dopt.result import TrialResult
 from orchestrate.config.launch_settings import LaunchSettings, count, text
 from orchestrate.errors import LaunchError
-from orchestrate.executors.base import Event, Task, TaskDone, failure_of, record_of
-from orchestrate.executors.inprocess import QueueExecutor
-from orchestrate.executors.registry import ExecutorFactory
+from orchestrate.executors.base import (
+    Event,
+    ExecutorFactory,
+    QueueExecutor,
+    Task,
+    TaskDone,
+    failure_of,
+    record_of,
+)
 from orchestrate.records import Failure
 
 DEVICE = "cpu"

@@ -17,13 +17,11 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Prepare, Run
-from orchestrate.executors.registry import Job, executor_factory, make_executor, make_job
+from orchestrate.executors.base import Job, Prepare, Run, executor_factory, make_executor, make_job
 from orchestrate.program import exit_code
-from orchestrate.runner.chunks import Chunks, SeedPlan
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
 from orchestrate.runner.saving import Heartbeat, RetryingStore
-from orchestrate.runner.scheduler import Scheduler
+from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan
 from orchestrate.store import (
     URL_VARIABLE,
     DatabaseMovedError,

@@ -14,18 +14,18 @@ from collections.abc import Sequence
 
 from tabulate import tabulate
 
-from dopt.spec.label import labels
+from dopt.spec.config import labels
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid, build_grid
 from orchestrate.config.command_line import Request
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.options import check_launch
 from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.executors.registry import executor_factory, make_job
+from orchestrate.executors.base import executor_factory, make_job
 from orchestrate.program import ROOT, answered, say, tell
-from orchestrate.runner.chunks import check_memory
 from orchestrate.runner.run_grid import WORK, Work, launch_grid
 from orchestrate.runner.saving import launch_record
+from orchestrate.runner.scheduler import check_memory
 from orchestrate.store import (
     FINISHED,
     RETRIED,

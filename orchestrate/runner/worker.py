@@ -21,16 +21,9 @@ from dopt.spec.config import completed
 from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config.launch_settings import LaunchSettings, factor
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Task
-from orchestrate.executors.registry import make_executor
+from orchestrate.executors.base import Task, make_executor
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
-from orchestrate.runner.chunks import (
-    BYTES_PER_GIB,
-    MAX_CHUNK_TRIALS,
-    Chunks,
-    memory_of_this_machine,
-)
 from orchestrate.runner.progress import (
     SIGNALS,
     Interrupt,
@@ -48,7 +41,14 @@ from orchestrate.runner.run_grid import (
     worked,
 )
 from orchestrate.runner.saving import RetryingStore, launch_record
-from orchestrate.runner.scheduler import SUSPECT_LOSSES, Scheduler
+from orchestrate.runner.scheduler import (
+    BYTES_PER_GIB,
+    MAX_CHUNK_TRIALS,
+    SUSPECT_LOSSES,
+    Chunks,
+    Scheduler,
+    memory_of_this_machine,
+)
 from orchestrate.store import OpenConfig
 
 WARNINGS = (*SIGNALS, signal.SIGUSR1)

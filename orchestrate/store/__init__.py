@@ -2,16 +2,13 @@
 
 :class:`Store` is the write side, used by launches; :class:`Reader` is the read side, used by the
 analysis. A trial is registered, claimed by one launch, and committed completely or rejected.
-What a command does to a whole database is in modules of their own: ``merge``, ``bundle``,
-``upgrade``, ``doctor`` and ``maintenance``.
+What a command does to a whole database is in modules of their own: ``merge``,
+``doctor`` and ``maintenance``.
 """
 
 from __future__ import annotations
 
-from orchestrate.records import URL_VARIABLE, Failure, RunRecord
-from orchestrate.store.backends.open import LEASE_SECONDS
-from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, default_url
-from orchestrate.store.errors import (
+from orchestrate.errors import (
     DatabaseMovedError,
     InvalidResultError,
     LaunchAliveError,
@@ -21,6 +18,8 @@ from orchestrate.store.errors import (
     StoreError,
     StoreUnavailableError,
 )
+from orchestrate.records import URL_VARIABLE, Failure, RunRecord
+from orchestrate.store.backends.base import DEFAULT_URL, READ_VARIABLE, default_url
 from orchestrate.store.launches import OpenConfig, OpenTrial
 from orchestrate.store.reader import (
     ExplorationRow,
@@ -45,7 +44,7 @@ from orchestrate.store.records import (
 )
 from orchestrate.store.results import Saved
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
-from orchestrate.store.store import Store
+from orchestrate.store.store import LEASE_SECONDS, Store
 
 __all__ = [
     "CONFIG_COLUMNS",

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from orchestrate.store import database_url, packed_curves
-from orchestrate.store.errors import StoreUnavailableError
+from orchestrate.errors import StoreUnavailableError
+from orchestrate.store import records
+from orchestrate.store.backends.base import parse_url
 from orchestrate.store.reader import Reader
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, SAMPLE_LOSS, STEP_VALUES
 
@@ -82,7 +83,7 @@ def examine(url: str, trial_key: TrialKey | None = None) -> list[Finding]:
     StoreError
         As :meth:`Reader.open` does; damage to a file that can still be opened is a finding.
     """
-    parsed = database_url.parse(url)
+    parsed = parse_url(url)
     is_file = parsed.get_backend_name() == "sqlite"
     findings: list[Finding] = []
     try:
@@ -155,7 +156,7 @@ def _damaged_curves(moment: Reader) -> list[Finding]:
             1_000, f"SELECT trial_id, {', '.join(STEP_VALUES)} FROM curve ORDER BY trial_id"
         )
         for trial_id, *arrays in rows
-        if any(not len(packed_curves.unpacked(one)) for one in arrays)
+        if any(not len(records.unpacked_curve(one)) for one in arrays)
     ]
     return _several("error", "trials with a packed curve that is damaged", damaged, _PACK_AGAIN)
 

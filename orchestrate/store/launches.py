@@ -14,8 +14,8 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Select, delete, insert, or_, select, text, update
 
+from orchestrate.errors import LaunchAliveError
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
-from orchestrate.store.errors import LaunchAliveError
 from orchestrate.store.records import (
     Claim,
     LaunchRecord,

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
-from orchestrate.store import database_url, packed_curves
+from orchestrate.errors import StoreError
+from orchestrate.store import records
 from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.base import Backend
+from orchestrate.store.backends.base import Backend, parse_url, public_url, sqlite_path
 from orchestrate.store.doctor import TrialKey
-from orchestrate.store.errors import StoreError
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import DTYPE, Array, stored_json, unpack
 from orchestrate.store.results import insert_error, steps_ahead, unpacked
@@ -332,7 +332,7 @@ class Target:
                     {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
                     for t, measure, value in one.curve.assessments
                 ]
-        packed_curves.write(self._connection, curves)
+        records.write_curves(self._connection, curves)
         for table, rows in (
             (attempt, attempts),
             (trajectory_table, trajectories),
@@ -595,12 +595,12 @@ def _named(row: Mapping[str, Any]) -> TrialName:
 
 
 def _refuse_itself(url: str, other_url: str) -> None:
-    one, other = database_url.parse(url), database_url.parse(other_url)
+    one, other = parse_url(url), parse_url(other_url)
     if one.get_backend_name() == other.get_backend_name() == "sqlite":
-        same = database_url.sqlite_path(one) == sqlite.existing_path(other)
+        same = sqlite_path(one) == sqlite.existing_path(other)
     else:
         same = one == other
     if same:
         raise StoreError(
-            f"Both databases are {database_url.safe(one)}: give another one to merge into it."
+            f"Both databases are {public_url(one)}: give another one to merge into it."
         )

@@ -15,12 +15,10 @@ import numpy as np
 from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
-from orchestrate.store import database_url, schema
+from orchestrate.errors import QueryError
+from orchestrate.store import schema
 from orchestrate.store.backends import postgresql, sqlite
-from orchestrate.store.backends.base import LaunchLife
-from orchestrate.store.backends.driver_errors import translated
-from orchestrate.store.errors import QueryError
-from orchestrate.store.packed_curves import read_curves
+from orchestrate.store.backends.base import LaunchLife, parse_url, public_url, translated
 from orchestrate.store.records import (
     Assessments,
     ConfigRow,
@@ -29,6 +27,7 @@ from orchestrate.store.records import (
     Table,
     Trajectory,
     TrialRow,
+    read_curves,
     stored_json,
     unpack,
 )
@@ -127,12 +126,12 @@ class Reader:
         self._moment = moment
         self._opening = moment is None
         self._kind = _kind(url)
-        self.safe_url = database_url.safe(url)
+        self.safe_url = public_url(url)
 
     @classmethod
     def open(cls, url: str) -> Self:
         """Open a database; raise ``NoDatabaseError`` or ``SchemaVersionError`` if that fails."""
-        parsed = database_url.parse(url)
+        parsed = parse_url(url)
         reader = cls(parsed, _kind(parsed).read_engine(parsed))
         try:
             reader.schema_version()

@@ -22,11 +22,10 @@ from sqlalchemy import (
     update,
 )
 
-from orchestrate.errors import without_password
+from orchestrate.errors import InvalidResultError, StoreError, without_password
 from orchestrate.records import Failure, RunRecord
-from orchestrate.store import packed_curves
+from orchestrate.store import records
 from orchestrate.store.backends.base import Backend
-from orchestrate.store.errors import InvalidResultError, StoreError
 from orchestrate.store.launches import GridRows, begin_attempts, living, register, renew
 from orchestrate.store.records import (
     DTYPE,
@@ -246,7 +245,7 @@ def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
         return False
     check_horizon(rows.claim.trial_key, len(rows.steps), horizon)
     backend.insert_steps(connection, rows.claim.trial_id, rows.steps)
-    packed_curves.write(connection, [(rows.claim.trial_id, rows.claim.attempt, rows.steps)])
+    records.write_curves(connection, [(rows.claim.trial_id, rows.claim.attempt, rows.steps)])
     connection.execute(_INSERT_TRAJECTORY, rows.trajectory)
     if rows.assessments:
         connection.execute(_INSERT_ASSESSMENT, rows.assessments)
@@ -491,7 +490,7 @@ def _write_steps(
         steps, n_stored = np.concatenate([steps, missing]), 0
         connection.execute(delete(step).where(step.c.trial_id == trial_id))
     backend.insert_steps(connection, trial_id, steps[n_stored:], n_stored)
-    packed_curves.write(connection, [(trial_id, rows.claim.attempt, steps)])
+    records.write_curves(connection, [(trial_id, rows.claim.attempt, steps)])
 
 
 def _replace_arrays(connection: Connection, rows: PreparedRows) -> None:

@@ -37,10 +37,10 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from orchestrate.store.errors import SchemaVersionError
+from orchestrate.errors import SchemaVersionError
 
 SCHEMA_VERSION = 7
-"""Number of the newest schema, the last of :data:`orchestrate.store.upgrade.STATEMENTS`."""
+"""Number of the newest schema, the last of :data:`orchestrate.store.maintenance.STATEMENTS`."""
 
 LOCK_TABLE = "store_lock"
 """Empty table on PostgreSQL whose lock keeps other launches from registering or recovering."""
@@ -108,9 +108,9 @@ class OutcomeColumn(NamedTuple):
 class Outcome:
     """Columns of a trial that its outcome fills; None before.
 
-    The table of trials and the views, what a launch writes, the rows of a reader, exports and
-    bundles are made from these fields, by their names: a column is added here, with statements
-    in :data:`orchestrate.store.upgrade.STATEMENTS`.
+    The table of trials and the views, what a launch writes, the rows of a reader and exports
+    are made from these fields, by their names: a column is added here, with statements
+    in :data:`orchestrate.store.maintenance.STATEMENTS`.
     """
 
     n_steps: Annotated[
@@ -235,7 +235,7 @@ step = _table(
     rowid=False,
 )
 
-# Columns of ``step`` once more (:mod:`orchestrate.store.packed_curves`).
+# Columns of ``step`` once more (:mod:`orchestrate.store.records`).
 curve = _table(
     "curve",
     _trial_key(primary_key=True, autoincrement=False),

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Self
 
+from sqlalchemy import URL
+
 from orchestrate.records import Failure, RunRecord
-from orchestrate.store import database_url, launches, results, schema
-from orchestrate.store.backends.base import Backend
-from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
+from orchestrate.store import launches, results, schema
+from orchestrate.store.backends.base import Backend, parse_url
+from orchestrate.store.backends.postgresql import PostgreSQLBackend
+from orchestrate.store.backends.sqlite import SQLiteBackend
 from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
 from orchestrate.store.records import (
     Claim,
@@ -19,6 +22,18 @@ from orchestrate.store.records import (
     Result,
 )
 from orchestrate.store.results import Saved
+
+LEASE_SECONDS = 60.0
+PATIENCE_SECONDS = 30.0
+
+
+def make_backend(
+    url: URL, lease_seconds: float = LEASE_SECONDS, patience: float = PATIENCE_SECONDS
+) -> Backend:
+    """Return the backend of a database, without checking or creating anything in it."""
+    if url.get_backend_name() == "sqlite":
+        return SQLiteBackend(url, patience)
+    return PostgreSQLBackend(url, lease_seconds, patience)
 
 
 class Store:
@@ -40,7 +55,7 @@ class Store:
         alive; on SQLite a file lock decides. ``patience`` bounds the wait for a lock of another
         process [s]. Raises ``SchemaVersionError`` for another version.
         """
-        backend = make_backend(database_url.parse(url), lease_seconds, patience)
+        backend = make_backend(parse_url(url), lease_seconds, patience)
         try:
             with backend.creation() as connection:
                 schema.create_or_check(connection, backend.safe_url)

@@ -18,9 +18,9 @@ from typing import Any
 
 from sqlalchemy.exc import DBAPIError
 
+from orchestrate.errors import QueryError
 from orchestrate.store import query_process
-from orchestrate.store.backends.driver_errors import is_of_driver, out_of_time, translated_query
-from orchestrate.store.errors import QueryError
+from orchestrate.store.backends.base import is_of_driver, out_of_time, translated_query
 from orchestrate.store.query_process import MEMORY_BYTES, Request
 from orchestrate.store.records import Table
 

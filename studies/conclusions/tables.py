@@ -9,10 +9,14 @@ import numpy as np
 import pandas as pd
 
 from analysis.stats.intervals import Estimate, geometric_mean
-from analysis.style import number, within
+from analysis.style import number, share, within
+from studies.conclusions.filter import PARTS
+from studies.conclusions.network import FORMS
 from studies.conclusions.trials import BEST, LEARNERS, PLANTS, SYSTEMS
 
-ROWS = Path(__file__).parents[2] / "docs" / "conclusions.csv"
+DOCS = Path(__file__).parents[2] / "docs"
+ROWS, NETWORK = DOCS / "conclusions.csv", DOCS / "network.csv"
+FILTER = DOCS / "filter_intervals.csv"
 """Rows of the published tables."""
 
 KEYS = ["env", "plant", "policy", "learner"]
@@ -125,7 +129,7 @@ def conclusions_states(rows: pd.DataFrame | None = None) -> str:
     rows = read() if rows is None else rows
     body = []
     for policy, title in INPUTS.items():
-        for learner in ("adam_window", "evidence"):
+        for learner in LEARNERS:
             cells = []
             for env in SYSTEMS:
                 cell = env, "ideal", policy, learner
@@ -164,3 +168,49 @@ TABLES = (
 def tables(rows: pd.DataFrame) -> str:
     """Return all tables."""
     return "\n".join(f"{made.__doc__}\n\n{made(rows)}" for made in TABLES)
+
+
+def conclusions_network(path: Path = NETWORK) -> str:
+    """Loss of the network, over the loss of the evidence model on the same samples."""
+    rows = pd.read_csv(path)
+    rows["ratio"] = rows.loss / rows.process
+    body = []
+    for form in FORMS:
+        cells = []
+        for env in SYSTEMS:
+            found = rows[(rows.form == form) & (rows.env == env)]
+            times = f"{found.ratio.min():.2g}, {found.ratio.max():.2g}"
+            cells.append(f"{times} ({found.seconds.mean():.0f} s)" if len(found) else "–")
+        body.append([form, *cells])
+    losses = [rows[rows.env == env].groupby("seed").process.first() for env in SYSTEMS]
+    body.append(["the process: loss", *(", ".join(map(number, one)) or "–" for one in losses)])
+    return markdown(["inputs of the network", *SYSTEMS], body)
+
+
+def filter_intervals(path: Path = FILTER) -> str:
+    """Whether the intervals of the filter over state and parameters hold, under both inputs."""
+    body = []
+    groups = pd.read_csv(path).groupby(["env", "steps", "regularization"], sort=False)
+    for (env, steps, prior), part in groups:
+        cells = [str(env), str(steps), f"{prior:g}"]
+        for when in PARTS:
+            means = part[[when, f"{when}_states", f"{when}_predictions"]].mean()
+            cells.append(" / ".join((f"{means.iloc[0]:.2g}", *map(share, means.iloc[1:]))))
+        ended = (part[part.policy == policy].loss.dropna() for policy in ("d_optimal", "random"))
+        body.append([*cells, " / ".join(number(middle(one).value) for one in ended)])
+    times = ("steps 10 to 90", "101 to 110", "200 to 500")
+    return markdown(["system", "steps of a fit", "λ", *times, "loss, D-optimal / random"], body)
+
+
+def filter_noise(path: Path = FILTER) -> str:
+    """Loss that the noise of the pendulum's angle leaves, by the variance of the prior."""
+    body = []
+    for policy, part in pd.read_csv(path).dropna(subset=["left"]).groupby("policy"):
+        left = (mean_text(part[name]) for name in ("left_narrow", "left", "left_wide"))
+        body.append([INPUTS[str(policy)], *left, mean_text(part.loss)])
+    variances = (f"variance {one:.2g}" for one in (1 / 30, 1 / 3, 1 / 0.3))
+    return markdown(["inputs", *variances, "loss, steps=4"], body)
+
+
+OTHERS = (conclusions_network, filter_intervals, filter_noise)
+"""Tables of other rows."""

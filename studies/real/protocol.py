@@ -19,8 +19,7 @@ import pandas as pd
 from dopt.fitting.fit import fit
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Model, data_of
-from dopt.fitting.predictions import predicted
-from dopt.fitting.problem import Simulator
+from dopt.fitting.problem import Simulator, predicted
 from dopt.fitting.simulation import Data
 from dopt.log import Log
 from dopt.systems.plant import Plant

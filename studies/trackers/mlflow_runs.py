@@ -1,6 +1,6 @@
-"""Finished trials of a bundle as runs of MLflow.
+"""Finished trials of a SQLite database as runs of MLflow.
 
-    python studies/trackers/mlflow_runs.py BUNDLE DATABASE
+    python studies/trackers/mlflow_runs.py RESULTS DATABASE
 
 needs the packages mlflow-skinny, alembic and sqlalchemy. Each system is an experiment; a run has
 the configuration as parameters, and losses and assessments as metrics with steps. Read it with
@@ -10,7 +10,9 @@ the configuration as parameters, and losses and assessments as metrics with step
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +26,11 @@ CALL = 1000
 RESULTS = ["final_loss", "best_loss", "wall_seconds", "cpu_seconds", "peak_memory_bytes"]
 
 
-def write_runs(bundle: Path, database: Path) -> None:
-    """Write every done and diverged trial of a bundle into a tracking store."""
-    read = {path.stem: pd.read_parquet(path) for path in bundle.glob("[!l]*.parquet")}
+def write_runs(results: Path, database: Path) -> None:
+    """Write every done and diverged trial of a database into a tracking store."""
+    with closing(sqlite3.connect(f"file:{results}?mode=ro", uri=True)) as source:
+        tables = ("config", "trial", "step", "assessment")
+        read = {name: pd.read_sql(f"SELECT * FROM {name}", source) for name in tables}
     trials = read["trial"].merge(read["config"], on="config_id")
     steps, assessed = (read[name].groupby("trial_id") for name in ("step", "assessment"))
     client, experiments = MlflowClient(tracking_uri=f"sqlite:///{database}"), dict[str, str]()

@@ -1,6 +1,6 @@
-"""Finished trials of a bundle as offline runs of Weights & Biases.
+"""Finished trials of a SQLite database as offline runs of Weights & Biases.
 
-    python studies/trackers/wandb_runs.py BUNDLE FOLDER
+    python studies/trackers/wandb_runs.py RESULTS FOLDER
 
 needs the package wandb. A run has the configuration, losses by step, and final losses and
 assessments as summary. ``wandb sync FOLDER/wandb/offline-run-*`` uploads the runs.
@@ -9,7 +9,9 @@ assessments as summary. ``wandb sync FOLDER/wandb/offline-run-*`` uploads the ru
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +22,11 @@ LOSSES = ["loss", "reachable_loss"]
 RESULTS = ["final_loss", "best_loss", "wall_seconds", "cpu_seconds", "peak_memory_bytes"]
 
 
-def write_runs(bundle: Path, folder: Path) -> None:
-    """Write every done and diverged trial of a bundle as an offline run into a folder."""
-    read = {path.stem: pd.read_parquet(path) for path in bundle.glob("[!l]*.parquet")}
+def write_runs(results: Path, folder: Path) -> None:
+    """Write every done and diverged trial of a database as an offline run into a folder."""
+    with closing(sqlite3.connect(f"file:{results}?mode=ro", uri=True)) as source:
+        tables = ("config", "trial", "step", "assessment")
+        read = {name: pd.read_sql(f"SELECT * FROM {name}", source) for name in tables}
     trials = read["trial"].merge(read["config"], on="config_id")
     steps, assessed = (read[name].groupby("trial_id") for name in ("step", "assessment"))
     # Nothing of this process, host or repository is recorded.

@@ -12,9 +12,8 @@ import pandas as pd
 
 from analysis import outputs
 from analysis.cli import add_database, add_selection, wanted
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter, IncompleteError
 from analysis.data.selection import Entry, Selection
-from analysis.errors import AnalysisError, IncompleteError
 from analysis.tables.rendering import TextTable
 from orchestrate.program import Parser, answered, path, run, tell
 from orchestrate.store import Reader

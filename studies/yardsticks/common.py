@@ -22,9 +22,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import latest
+from analysis.data.matching import AnalysisError, latest
 from analysis.data.selection import Entry
-from analysis.errors import AnalysisError
 from analysis.stats.intervals import CONFIDENCE
 from analysis.style import within
 from analysis.tables.comparisons import against_reference

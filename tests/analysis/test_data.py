@@ -14,13 +14,15 @@ import pandas as pd
 import pytest
 
 import analysis
-from analysis.data.frames import STEP_COLUMNS
-from analysis.data.matching import Filter, defaults, nearness, newest
-from analysis.data.samples import learned_model, simulated_trial
+from analysis.data.matching import AnalysisError, Filter, defaults, nearness, newest
+from analysis.data.samples import STEP_COLUMNS, learned_model, simulated_trial
 from analysis.data.selection import is_possible, select
-from analysis.errors import AnalysisError
-from analysis.figures.input_spectrum import measure_spectra, tabulate_spectra
-from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
+from analysis.figures.phase_portraits import (
+    measure_portraits,
+    measure_spectra,
+    tabulate_portraits,
+    tabulate_spectra,
+)
 from analysis.stats.curves import PlotOptions, measure_curves, tabulate_curves
 from analysis.stats.intervals import Statistic
 from analysis.tables.comparisons import compare_policies

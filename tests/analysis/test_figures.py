@@ -1,4 +1,4 @@
-"""Numbers and drawings of figures 4, 6, 7 and 8."""
+"""Numbers and drawings of figure 6, ratios over all systems, and trials of other widths."""
 
 from __future__ import annotations
 
@@ -14,39 +14,16 @@ from analysis.cli import main
 from analysis.data.matching import Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
-from analysis.figures import pareto as figure6
-from analysis.figures import profiles as figure7
-from analysis.figures import sensitivity as figure8
 from analysis.figures.pareto import (
     PARETO,
     Point,
+    draw,
     measure_points,
     pareto_part,
     policies_of,
     policy_colours,
 )
-from analysis.figures.profiles import (
-    measure_profiles,
-    profiles_part,
-    tabulate_profiles,
-)
-from analysis.figures.sensitivity import (
-    SENSITIVITY,
-    Line,
-    measure_lines,
-    sensitivity_part,
-)
-from analysis.figures.width import (
-    exponent,
-    measure_costs,
-    measure_losses,
-    tabulate_costs,
-    tabulate_losses,
-    width_part,
-)
-from analysis.outputs import build
 from analysis.stats.curves import PlotOptions
-from analysis.stats.intervals import Estimate
 from analysis.stats.scores import on_front
 from analysis.tables.comparisons import compare_policies
 from dopt.result import TrialResult
@@ -54,45 +31,6 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, wide
 from tests.analysis.synthetic import fill, make_grid
-
-
-def test_a_profile_counts_runs_and_rises_to_those_that_did_not_diverge(reader: Reader) -> None:
-    selection = select(reader, Filter())
-    profiles = {one.label: one for one in measure_profiles(profiles_part(selection))}
-    random = profiles["random"]
-    assert random.environments == ("pendulum", "cartpole", "quadrotor")
-    assert (random.n, random.n_diverged) == (15, 1)
-    assert (np.diff(random.share.centre) >= 0).all()
-    assert random.share.centre[-1] == pytest.approx((1 + 0.8 + 1) / 3)
-    assert profiles["D-optimal"].share.centre[-1] == 1.0
-    assert profiles["periodic"].environments == ("pendulum", "cartpole")
-
-
-def test_a_point_of_a_profile_by_hand(reader: Reader) -> None:
-    selection = select(reader, Filter(("pendulum",), ("d_optimal", "random")))
-    own, reference = (
-        np.array(list(entry.final_losses().values()))
-        for entry in sorted(selection.entries, key=lambda one: one.config.policy != "random")
-    )
-    [profile] = [one for one in measure_profiles(selection) if one.label == "random"]
-    place = 150
-    limit = profile.factors[place] * np.exp(np.mean(np.log(reference)))
-    assert profile.share.centre[place] == np.mean(own <= limit)
-
-
-def test_the_caption_says_what_is_in_fewer_environments(reader: Reader) -> None:
-    profiles = measure_profiles(profiles_part(select(reader, Filter())))
-    words = figure7.caption(profiles)
-    assert "In fewer environments: periodic: pendulum, cartpole" in words
-    assert "random: 15, 1 diverged" in words
-    [legend] = figure7.draw(profiles).legends
-    assert "periodic (2 of 3 systems)" in [text.get_text() for text in legend.get_texts()]
-    assert len(tabulate_profiles(profiles)) == 301 * 4  # all but the oracle
-
-
-def test_one_policy_has_no_profile(reader: Reader) -> None:
-    alone = select(reader, Filter(policies=("d_optimal",)))
-    assert profiles_part(alone).entries == ()
 
 
 def test_the_ratio_over_systems_is_the_geometric_mean_of_theirs(
@@ -118,85 +56,6 @@ def test_the_table_says_which_systems_a_row_is_of(
     assert "14, 1 diverged" in printed
     assert main(["aggregate", "--db", url, "--policy", "random"]) == 2
     assert "needs trials of the reference d_optimal" in capsys.readouterr().err
-
-
-RATES = (1e-3, 1e-2, 1e-1)
-RIDGES = (1e-4, 1e-3, 1e-2)
-
-
-@pytest.fixture(scope="module")
-def varied(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return two policies in two systems under three learning rates and three λ, one diverged."""
-    address = f"sqlite:///{tmp_path_factory.mktemp('sensitivity')}/results.db"
-    envs, both, seeds = ("pendulum", "arm"), ("d_optimal", "random"), range(3)
-    specs = [
-        spec
-        for rate in RATES
-        for spec in make_grid(envs, both, seeds, learner={"learning_rate": rate}, **SHORT)
-    ]
-    for ridge in RIDGES:
-        specs += make_grid(envs, both[:1], seeds, policy={"regularization": ridge}, **SHORT)
-    two = {"learning_rate": 0.1}, {"regularization": 0.01}  # differ in both: part of no line
-    specs += make_grid(envs, both[:1], seeds, learner=two[0], policy=two[1], **SHORT)
-    specs += make_grid(envs, ("uniform",), seeds, **SHORT)  # has no line
-    specs = list({spec.trial_key: spec for spec in specs}.values())
-    lost = [s for s in specs if s.policy.name == "random" and s.system.name == "arm"]
-    slow = [s for s in lost if s.to_mapping()["learner"]["learning_rate"] == 1e-3 and s.seed == 0]
-    fill(address, specs, diverged={slow[0].trial_key: 20})
-    return address
-
-
-def measured(url: str) -> tuple[Line, ...]:
-    with Reader.open(url) as reader:
-        part = sensitivity_part(select(reader, Filter()))
-        return measure_lines(reader, part, DivergenceRule.EXCLUDE)
-
-
-def test_a_line_varies_one_setting_and_others_have_a_level(varied: str) -> None:
-    lines = {(one.env, one.policy, one.setting): one for one in measured(varied)}
-    assert len(lines) == 2 * 2 * 2
-    rates = lines["arm", "random", "learner.learning_rate"]
-    assert (rates.values, rates.usual) == (RATES, 1e-2)
-    ridges = lines["pendulum", "d_optimal", "policy.regularization"]
-    assert (ridges.values, ridges.usual) == (RIDGES, 1e-3)
-    level = lines["pendulum", "random", "policy.regularization"]
-    assert level.values == ()
-    assert level.losses == (lines["pendulum", "random", "learner.learning_rate"].losses[1],)
-
-
-def test_losses_are_geometric_means_and_diverged_trials_are_counted(varied: str) -> None:
-    [line] = [
-        one
-        for one in measured(varied)
-        if (one.env, one.policy, one.setting) == ("arm", "random", "learner.learning_rate")
-    ]
-    assert [one.describe() for one in line.scores] == ["2/3, 1 diverged", "3", "3"]
-    for loss, scores in zip(line.losses, line.scores, strict=True):
-        assert loss.value == pytest.approx(np.exp(np.log(scores.values).mean()))
-    assert "random, learning_rate=0.001: 2/3, 1 diverged" in figure8.caption((line,))
-
-
-def test_it_has_a_row_for_each_system_and_a_column_for_each_setting(varied: str) -> None:
-    lines = measured(varied)
-    figure = figure8.draw(lines)
-    assert len(figure.axes) == 2 * 2
-    labels = [axes.get_xlabel() for axes in figure.axes[2:]]
-    assert labels == ["λ of the information matrix", "learning rate"]
-    assert "Level: random" in figure8.caption(lines)
-
-
-def test_two_values_are_too_few(reader: Reader, tmp_path: Path) -> None:
-    address = f"sqlite:///{tmp_path}/few.db"
-    for rate in RATES[:2]:
-        learner = {"learning_rate": rate}
-        fill(address, make_grid(("arm",), ("random",), range(2), learner=learner, **SHORT))
-    with Reader.open(address) as few:
-        assert sensitivity_part(select(few, Filter())).entries == ()
-    plot = SENSITIVITY
-    part = plot.part(select(reader, Filter()), PlotOptions())
-    assert {entry.config.policy for entry in part.entries} == {"random"}
-    table = plot.make(reader, part, PlotOptions()).table
-    assert table["value"].tolist() == [10.0, 20.0, 40.0, 60.0, 100.0]
 
 
 def reader_of(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Reader:
@@ -231,95 +90,7 @@ def test_however_many_trials_another_width_has(tmp_path: Path, seeds: int) -> No
 def test_a_database_of_widths_alone_takes_the_width_of_the_paper(tmp_path: Path) -> None:
     specs = [spec for width in (8, 16, 32) for spec in wide(width, range(3))]
     with reader_of(tmp_path, (specs, [])) as reader:
-        selection = select(reader, Filter())
-    assert widths_of(selection) == [16]
-    assert widths_of(width_part(selection)) == [8, 16, 32]
-
-
-def test_all_widths_are_taken_and_the_condition_of_the_user_holds(reader: Reader) -> None:
-    assert widths_of(width_part(select(reader, Filter()))) == [4, 8, 16, 32, 64]
-    narrowed = select(reader, Filter(where={"model.width": 16}))
-    assert width_part(narrowed).entries == ()
-    assert width_part(select(reader, Filter(("pendulum",)))).entries == ()
-
-
-def test_two_widths_are_too_few_and_that_is_said(tmp_path: Path) -> None:
-    with reader_of(tmp_path, (wide(8, range(2)) + wide(16, range(2)), [])) as reader:
-        names = ("figure4_width", "figure4_width_loss")
-        outcomes = list(build(reader, select(reader, Filter()), PlotOptions(), tmp_path, names))
-    assert {one.state for one in outcomes} == {"not drawn, nothing is stored for it"}
-
-
-def test_costs_are_medians_over_steps_and_trials(reader: Reader) -> None:
-    part = width_part(select(reader, Filter()))
-    numbers = measure_costs(reader, part)
-    assert [cost.part for cost in numbers.costs] == ["plan", "learn", "evaluate"]
-    assert numbers.limit_us == pytest.approx(20_000)
-    plan = numbers.costs[0]
-    values = reader.curves(part.entries[0].config.config_key, "plan_us").values
-    assert plan.median[0] == np.median(values)
-    assert (plan.low[0], plan.high[0]) == tuple(np.quantile(values, [0.1, 0.9]))
-    assert plan.n.tolist() == [5] * 5
-    assert plan.exponent == pytest.approx(2.0, abs=0.2)
-    table = tabulate_costs(numbers)
-    assert len(table) == 15
-    assert table.query("part == 'plan'")["median_us"].tolist() == plan.median.tolist()
-
-
-def test_a_diverged_trial_counts_in_neither(tmp_path: Path) -> None:
-    specs = [spec for width in (8, 16, 32) for spec in wide(width, range(4))]
-    address = f"sqlite:///{tmp_path}/results.db"
-    fill(address, specs, diverged={specs[1].trial_key: 20})
-    with Reader.open(address) as reader:
-        part = width_part(select(reader, Filter()))
-        costs = measure_costs(reader, part)
-        losses = measure_losses(reader, part, DivergenceRule.EXCLUDE)
-    assert costs.costs[0].n.tolist() == [3, 4, 4]
-    assert losses.n == (3, 4, 4)
-    assert losses.counts == ("3/4, 1 diverged", "4", "4")
-
-
-def test_losses_have_two_standard_errors(reader: Reader) -> None:
-    part = width_part(select(reader, Filter()))
-    numbers = measure_losses(reader, part, DivergenceRule.EXCLUDE)
-    finals = reader.curves(part.entries[2].config.config_key).values[:, -1]
-    assert numbers.mean[2] == pytest.approx(finals.mean())
-    table = tabulate_losses(numbers)
-    assert table["width"].tolist() == [4, 8, 16, 32, 64]
-    assert table["two_standard_errors"][2] == pytest.approx(2 * finals.std(ddof=1) / 5**0.5)
-
-
-def test_unfinished_trials_are_noted(tmp_path: Path) -> None:
-    specs = [spec for width in (8, 16, 32) for spec in wide(width, range(3))]
-    with reader_of(tmp_path, (specs, specs[-1:])) as reader:
-        part = width_part(select(reader, Filter()))
-    assert part.notes == ("cartpole, width 32: 1 trials are not finished",)
-
-
-def test_other_forms_of_the_information_matrix_are_other_lines(tmp_path: Path) -> None:
-    widths = (8, 16, 32)
-    usual = [spec for width in widths for spec in wide(width, range(3))]
-    dual = [s for width in widths for s in wide(width, range(3), policy={"form": "dual"})]
-    other = [s for width in widths for s in wide(width, range(3), policy={"regularization": 0.5})]
-    with reader_of(tmp_path, (dual + other + usual, [])) as reader:
-        part = width_part(select(reader, Filter()))
-        costs = measure_costs(reader, part).costs
-        losses = measure_losses(reader, part, DivergenceRule.EXCLUDE)
-    assert [(cost.form, cost.part) for cost in costs] == [
-        ("auto", "plan"),
-        ("auto", "learn"),
-        ("auto", "evaluate"),
-        ("dual", "plan"),
-    ]
-    assert losses.widths.tolist() == list(widths)
-
-
-def test_the_exponent_is_fitted_to_the_upper_half() -> None:
-    widths = np.array([8, 16, 32, 64, 128, 256])
-    assert exponent(widths, 3.0 * widths**1.5) == pytest.approx(1.5)
-    costs = np.where(widths < 64, 7.0, widths.astype(float) ** 2)
-    assert exponent(widths, costs) == pytest.approx(2.0)
-    assert exponent(widths[:3], widths[:3]) == pytest.approx(1.0)
+        assert widths_of(select(reader, Filter())) == [16]
 
 
 LEARNERS: tuple[dict[str, object], ...] = (
@@ -426,32 +197,10 @@ def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> Non
     assert {row["on_front"] for row in rows} == {"True", "False"}
 
 
-def point(place: int, us: float, loss: float, label: str) -> Point:
-    estimate = Estimate(loss, 0.8 * loss, 1.2 * loss)
-    names = {"policy": "random", "policy_words": f"random {place}", "learner_words": "adam"}
-    counts = {"n": 20, "n_finished": 20, "n_diverged": 0, "counts": "20"}
-    return Point("arm", label, us=us, loss=estimate, unit="rad/s²", limit_us=2e4, on_front=True,
-                 **names, **counts)  # type: ignore[arg-type] # fmt: skip
-
-
-def test_the_list_of_the_front_covers_no_point() -> None:
-    label = "look-ahead, gauss_newton, refit_every=10"
-    points = [point(i, 10.0 * 2**i, 1.0 / 1.1**i, label) for i in range(14)]
-    figure = figure6.draw(tuple(points))
-    figure.draw_without_rendering()
-    [axes] = figure.axes
-    [listed] = [text for text in axes.texts if label in text.get_text()]
-    corner = listed.get_window_extent()
-    places = axes.transData.transform([(one.us, one.loss.low) for one in points])
-    assert not any(corner.contains(*place) for place in places)
-    assert any("dt = 20 ms" in text.get_text() for text in axes.texts)
-
-
-def test_numbers_of_points_in_one_place_are_drawn_together() -> None:
-    places = [(10.0, 2.0), (100.0, 0.5), (100.1, 0.499), (1000.0, 0.1)]
-    points = [point(i, us, loss, f"random {i}") for i, (us, loss) in enumerate(places)]
-    [axes] = figure6.draw(tuple(points)).axes
-    assert {"1", "2, 3", "4"} <= {text.get_text() for text in axes.texts}
+def test_the_time_between_two_steps_is_marked(learners: str) -> None:
+    points = tuple(replace(one, limit_us=10.0) for one in points_of(learners))
+    first, *_ = draw(points).axes
+    assert [text.get_text() for text in first.texts] == ["dt = 0.01 ms"]
 
 
 def test_policies_of_one_colour_are_told_apart() -> None:

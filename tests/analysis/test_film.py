@@ -11,9 +11,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from analysis.cli import main
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import select
-from analysis.errors import AnalysisError
 from analysis.film import Story, _stage, shoot, tell
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

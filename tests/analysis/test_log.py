@@ -18,11 +18,9 @@ from scipy.io import savemat
 
 import analysis
 from analysis import cli
-from analysis.errors import AnalysisError
-from analysis.logs.excitation import MOST_ROWS, Effect, effects
-from analysis.logs.health import Health, examine, quantum
-from analysis.logs.report import lines
-from analysis.logs.tables import log_of, read_table
+from analysis.data.matching import AnalysisError
+from analysis.log_health import MOST_ROWS, Effect, Health, effects, examine, quantum
+from analysis.log_report import lines, log_of, read_table
 from dopt.errors import SpecificationError
 from dopt.log import Log
 

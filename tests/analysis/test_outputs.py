@@ -19,12 +19,10 @@ import pytest
 
 from analysis import outputs
 from analysis.cli import main, parser
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError
-from analysis.figures.input_spectrum import spectrum_plot
 from analysis.figures.loss_curves import _title, loss_plot
-from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot
+from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot, spectrum_plot
 from analysis.outputs import FIGURES, NAMES, Task, build, plots
 from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
@@ -269,7 +267,7 @@ def test_what_is_drawn_by_changed_code_is_drawn_again(
     monkeypatch.setattr(outputs, "PACKAGE", copied)
     assert make(reader, selection, tmp_path / "out") == ["written", "written"]
     assert make(reader, selection, tmp_path / "out") == ["unchanged", "unchanged"]
-    drawing = copied / "figures" / "input_spectrum.py"
+    drawing = copied / "figures" / "phase_portraits.py"
     drawing.write_text(drawing.read_text() + "# changed\n")
     assert make(reader, selection, tmp_path / "out") == ["written", "written"]
 

@@ -14,11 +14,10 @@ import pytest
 from scipy import stats
 
 from analysis.cli import main
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError
 from analysis.report import control_section, write_report
-from analysis.stats.control import measure_control, scores_at
+from analysis.stats.scores import measure_control, scores_at
 from analysis.style import number
 from analysis.tables.comparisons import compare_policies
 from analysis.tables.variants import (

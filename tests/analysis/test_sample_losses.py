@@ -14,9 +14,9 @@ from scipy import stats
 from starlette.testclient import TestClient
 
 from analysis.cli import main
-from analysis.data.frames import load
+from analysis.data.samples import load
 from analysis.serve.app import create_app
-from analysis.tables import sample_losses
+from analysis.tables import rendering
 from dopt.offline_fit import sample_loss
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -106,7 +106,7 @@ def test_what_is_stored_is_in_tables_report_and_browser_and_is_not_fitted_again(
     summary = ("summary", "--db", url, "--format", "csv")
     assert "sample_loss" not in run(capsys, *summary)[0]
     fitted, _ = run(capsys, "sample-loss", "--db", url, "--store")
-    monkeypatch.setattr(sample_losses, "sample_loss", None)
+    monkeypatch.setattr(rendering, "sample_loss", None)
     assert run(capsys, "sample-loss", "--db", url, "--store")[0] == fitted
     own = expected("random")[:, 1]
     table = pd.read_csv(io.StringIO(run(capsys, *summary)[0])).set_index("policy")

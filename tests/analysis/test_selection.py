@@ -17,10 +17,18 @@ from omegaconf import DictConfig, OmegaConf
 
 import analysis
 from analysis.cli import main
-from analysis.data.matching import USUAL, Filter, _argument, choose, difference, flatten, newest
+from analysis.data.matching import (
+    USUAL,
+    AnalysisError,
+    Filter,
+    _argument,
+    choose,
+    difference,
+    flatten,
+    newest,
+)
 from analysis.data.samples import DivergenceRule, apply_rule
 from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, ranges, select
-from analysis.errors import AnalysisError
 from analysis.tables.comparisons import compare_policies, references
 from dopt import registry
 from dopt.policies import POLICIES

@@ -14,10 +14,9 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from analysis.cli import main
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
-from analysis.errors import AnalysisError
 from analysis.stats.intervals import (
     BAND_RESAMPLES,
     CONTENT,

@@ -17,23 +17,12 @@ from hypothesis.extra.numpy import arrays
 
 import analysis
 from analysis.cli import main
-from analysis.data.matching import Filter
+from analysis.data.matching import AnalysisError, Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
-from analysis.errors import AnalysisError
-from analysis.figures.control import caption_control, draw_control
-from analysis.figures.input_spectrum import caption, measure_spectra, tabulate_spectra
+from analysis.figures.phase_portraits import measure_spectra, spectrum_caption, tabulate_spectra
 from analysis.outputs import build
 from analysis.report import CAPTION, EXPLAINED
-from analysis.stats.control import (
-    ControlCurve,
-    control_part,
-    measure_control,
-    relative_costs,
-    scores_at,
-    tabulate_control,
-    true_model,
-)
 from analysis.stats.curves import (
     Axis,
     PlotOptions,
@@ -43,7 +32,15 @@ from analysis.stats.curves import (
     tabulate_curves,
     wrapped_line,
 )
-from analysis.stats.scores import Measure
+from analysis.stats.scores import (
+    ControlCurve,
+    Measure,
+    control_part,
+    measure_control,
+    relative_costs,
+    scores_at,
+    true_model,
+)
 from analysis.style import count_text, number, p_text, plus_minus, unit_of
 from analysis.tables.comparisons import compare_control, compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table
@@ -374,7 +371,7 @@ def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
         assert costs.values.shape == (3, 3)
         assert scores_at(reader, entry, 19).by_seed == {}
         assert sorted(scores_at(reader, entry, 20).by_seed) == [0, 1, 2]
-        assert tabulate_control(measure_control(reader, part)).n.tolist() == [3, 3, 3]
+        assert [one.n.tolist() for one in measure_control(reader, part)] == [[3, 3, 3]]
 
 
 def valued(
@@ -416,10 +413,8 @@ def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
     assert {seed for seed, score in scores.items() if np.isinf(score)} == {1, 3}
     finite = [score for score in scores.values() if np.isfinite(score)]
     assert curve.cost[1] == pytest.approx(np.exp(np.mean(np.log(finite))))
-    assert tabulate_control(curves).lost.tolist() == [0, 0, 0, 0, 2, 0]
-    assert "random: 5, 2 lost" in caption_control(curves)
-    assert "Lost: episodes" in caption_control(curves)
-    assert "2 lost" in draw_control(curves).axes[0].get_title()
+    assert [one.lost.tolist() for one in curves] == [[0, 0, 0], [0, 2, 0]]
+    assert curve.counts == "5, 2 lost"
     row = table[table.t == 20].iloc[0]
     assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 0.0)
     assert row.p_value == pytest.approx(2 / 2**5)  # all five, the lost ones too
@@ -443,20 +438,6 @@ def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> 
     assert "| –, 5 lost |" in " ".join(control_table(table).markdown().split())
 
 
-def test_the_picture_has_a_column_for_each_task(reader: Reader, part: Selection) -> None:
-    curves = measure_control(reader, part)
-    figure = draw_control(curves)
-    titles = [axes.get_title() for axes in figure.axes]
-    assert [title.split("\n")[0] for title in titles[:2]] == ["pendulum", "quadrotor"]
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["D-optimal", "uniform", "random", "true model"]
-    caption = caption_control(curves)
-    assert "Wilson" in caption
-    assert "pendulum: n = 5" in caption
-    odd = dataclasses.replace(curves[0], cost=np.full(4, np.nan), cost_low=np.full(4, np.nan))
-    draw_control((odd,))
-
-
 def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/ceiling.db"
     task = {"task": {"name": "control", "checkpoints": [20]}}
@@ -473,19 +454,13 @@ def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
     assert (truth.n, truth.lost) == (5, 1)  # each seed once
     assert truth.success == pytest.approx(3 / 5)
     assert truth.success_low < 3 / 5 < truth.success_high
-    assert set(tabulate_control(curves).true_model_success) == {truth.success}
-    rates, costs = draw_control(curves).axes
-    for axes, height in ((rates, truth.success), (costs, 1.0)):
-        flat = [line for line in axes.get_lines() if list(line.get_ydata()) == [height] * 2]
-        assert [line.get_linestyle() != "-" for line in flat] == [True]
-    assert "dashed: of the same planner with the true model" in caption_control(curves)
-    assert "(pendulum 0.60)" in caption_control(curves)
+    assert {one.truth for one in curves} == {truth}
 
 
-def test_a_grid_without_a_task_has_no_such_figure(tmp_path: Path) -> None:
+def test_a_grid_without_a_task_has_no_such_table(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
     fill(url, make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT))
-    names = ("figure5_control", "comparison_control")
+    names = ("comparison_control",)
     with Reader.open(url) as reader:
         outcomes = build(
             reader, select(reader, Filter()), PlotOptions(), tmp_path / "figures", names
@@ -632,7 +607,7 @@ def test_a_policy_of_which_every_trial_diverged_is_named(tmp_path: Path) -> None
         spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
     assert [one.policy for one in spectra.policies] == ["d_optimal"]
     assert spectra.diverged == ("random",)
-    assert "Not drawn, because every trial diverged: random." in caption(spectra)
+    assert "Not drawn, because every trial diverged: random." in spectrum_caption(spectra)
 
 
 def test_unit_of() -> None:

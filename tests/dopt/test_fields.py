@@ -22,8 +22,7 @@ from dopt.policies import POLICIES
 from dopt.policies.base import CompiledPolicy
 from dopt.policies.open_loop import RandomSphere
 from dopt.registry import added_defaults, build, identifying_section, section_of
-from dopt.spec.config import completed
-from dopt.spec.label import config_label, labels
+from dopt.spec.config import completed, config_label, labels
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Pendulum
 from tests.dopt.trials import trial

@@ -17,7 +17,7 @@ from dopt.limits import Limits
 from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.run import run_trial
-from dopt.spec.label import config_label
+from dopt.spec.config import config_label
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import delay, differentiated
 from dopt.types import Array

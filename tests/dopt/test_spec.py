@@ -23,8 +23,7 @@ from dopt.models import MODELS
 from dopt.policies import POLICIES, TITLES
 from dopt.registry import build
 from dopt.run import run_trial
-from dopt.spec.config import completed
-from dopt.spec.label import config_label, labels, value_label
+from dopt.spec.config import completed, config_label, labels, value_label
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Pendulum
 from dopt.systems.properties import euler_spectral_radius, jacobians

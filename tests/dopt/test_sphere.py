@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from dopt.errors import DoptError, SpecificationError
 from dopt.policies.search import LARGEST_REPELLED, sphere_directions
-from dopt.reference.planning import QuadraticProblem, d_optimal_inputs, maximize_on_spheres
+from dopt.reference.models import QuadraticProblem, d_optimal_inputs, maximize_on_spheres
 from dopt.sphere import maximize_on_sphere, sphere_maximizer
 
 TINIEST = 5e-324

@@ -16,7 +16,8 @@ from dopt.kernel import warm_up
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from orchestrate.runner import launch, start
+from orchestrate import launch
+from orchestrate.runner import start
 from orchestrate.runner.run_grid import Work
 
 PAUSE = "WITNESS_PAUSE"

@@ -60,7 +60,8 @@ def command_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str, str]]:
     """Return a function that runs ``launch.py`` in this process: exit code, output and errors."""
-    from orchestrate.runner import launch, start
+    from orchestrate import launch
+    from orchestrate.runner import start
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["launch.py", *arguments])

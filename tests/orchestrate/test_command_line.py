@@ -26,8 +26,8 @@ from orchestrate.program import SUCCESSORS
 from orchestrate.runner import run_grid
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
+from orchestrate.store.backends.base import parse_url
 from orchestrate.store.backends.sqlite_engine import existing_path
-from orchestrate.store.database_url import parse
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.pages import commands
 from tests.paths import ROOT
@@ -605,12 +605,12 @@ def test_a_variable_in_the_address_makes_no_folder(
 
 
 def test_a_password_may_hold_what_a_path_may_not() -> None:
-    url = parse("postgresql://me:$HOME%7E~%0A@host/dopt\n")
+    url = parse_url("postgresql://me:$HOME%7E~%0A@host/dopt\n")
     assert (url.password, url.database) == ("$HOME~~\n", "dopt")
     with pytest.raises(StoreError, match="holds the control character") as raised:
         Reader.open("postgresql://me:secret@host/do\npt")
     assert "secret" not in str(raised.value)
-    assert str(existing_path(parse("sqlite:////dev/../etc/hostname "))) == "/etc/hostname"
+    assert str(existing_path(parse_url("sqlite:////dev/../etc/hostname "))) == "/etc/hostname"
 
 
 def parsers() -> Iterator[argparse.ArgumentParser]:

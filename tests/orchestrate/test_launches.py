@@ -14,11 +14,11 @@ from dopt.errors import SpecificationError
 from dopt.run import run_trial
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
+from orchestrate import launch
 from orchestrate.__main__ import main
 from orchestrate.config import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings, Share, share
 from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.runner import launch
 from orchestrate.runner.run_grid import Work, collected, launch_grid
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError
 from orchestrate.store.doctor import examine

@@ -19,7 +19,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import Cartpole, Quadrotor
 from orchestrate import __main__ as orchestrate
-from orchestrate.runner import launch
+from orchestrate import launch
 from studies.agents.policies import (
     LIMIT,
     ActiveExploration,

@@ -1,4 +1,4 @@
-"""Runs of trackers from a bundle: read back by the libraries that others use."""
+"""Runs of trackers from a database: read back by the libraries that others use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from dopt.spec.trial import TrialSpec
-from orchestrate import __main__ as orchestrate
 from tests.analysis.synthetic import fake_results, fill, make_grid
 from tests.studies.wandb_file import OfflineRun, read_run
 
@@ -31,11 +30,9 @@ def _warnings_of_libraries() -> Iterator[None]:
 
 
 @pytest.fixture
-def bundle(tmp_path: Path) -> Path:
+def results(tmp_path: Path) -> Path:
     fill(f"sqlite:///{tmp_path}/r.db", SPECS, diverged=LOST)
-    words = ["export", "bundle", str(tmp_path / "bundle"), "--db", f"sqlite:///{tmp_path}/r.db"]
-    assert orchestrate.main(words) == 0
-    return tmp_path / "bundle"
+    return tmp_path / "r.db"
 
 
 def losses(spec: TrialSpec) -> list[float]:
@@ -43,13 +40,13 @@ def losses(spec: TrialSpec) -> list[float]:
     return [float(value) for value in found.loss[: found.n_steps]]
 
 
-def test_mlflow_reads_every_run(bundle: Path, tmp_path: Path) -> None:
+def test_mlflow_reads_every_run(results: Path, tmp_path: Path) -> None:
     pytest.importorskip("mlflow")
     from mlflow import MlflowClient
 
     from studies.trackers.mlflow_runs import write_runs
 
-    write_runs(bundle, tmp_path / "mlflow.db")
+    write_runs(results, tmp_path / "mlflow.db")
     client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlflow.db")
     names = [one.experiment_id for one in client.search_experiments()]
     found = {run.data.tags["trial_key"]: run for run in client.search_runs(names)}
@@ -71,11 +68,11 @@ def test_mlflow_reads_every_run(bundle: Path, tmp_path: Path) -> None:
         assert [(one.step, one.value) for one in history] == [(c.t, c.value) for c in costs]
 
 
-def test_wandb_reads_every_run(bundle: Path, tmp_path: Path) -> None:
+def test_wandb_reads_every_run(results: Path, tmp_path: Path) -> None:
     pytest.importorskip("wandb")
     from studies.trackers.wandb_runs import write_runs
 
-    write_runs(bundle, tmp_path / "out")
+    write_runs(results, tmp_path / "out")
     found: dict[str, OfflineRun] = {}
     for path in (tmp_path / "out").glob("wandb/offline-run-*/run-*.wandb"):
         run = read_run(path)

@@ -7,8 +7,7 @@ import sys
 
 from dopt.process import usable_cores
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.executors.base import Executor, Prepare, Run
-from orchestrate.executors.registry import ExecutorFactory, limits_of
+from orchestrate.executors.base import Executor, ExecutorFactory, Prepare, Run, limits_of
 
 if "ray" not in sys.modules:
     # Ray reads this when it is first imported. A driver without it takes its raylet for dead if the

@@ -18,8 +18,8 @@ from typing import Any
 from dopt.errors import DoptError, given_path
 from orchestrate.config.launch_settings import LaunchSettings, count, limit, section, text, wrong
 from orchestrate.errors import InfrastructureError, LaunchError, without_password
+from orchestrate.executors.base import ExecutorFactory
 from orchestrate.executors.limits import module_path
-from orchestrate.executors.registry import ExecutorFactory
 from orchestrate.program import length_of_time
 
 LEAVE_SECONDS = 120

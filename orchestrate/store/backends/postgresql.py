@@ -31,10 +31,17 @@ from sqlalchemy import (
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
-from orchestrate.store import database_url
-from orchestrate.store.backends.backups import back_up_to, dump
-from orchestrate.store.backends.base import ANNOUNCE_SECONDS, Backend, LaunchLife, NewTrial, log
-from orchestrate.store.errors import StoreError, StoreUnavailableError
+from orchestrate.errors import StoreError, StoreUnavailableError
+from orchestrate.store.backends.base import (
+    ANNOUNCE_SECONDS,
+    Backend,
+    LaunchLife,
+    NewTrial,
+    back_up_to,
+    dump,
+    log,
+    public_url,
+)
 from orchestrate.store.records import Array, finite_list
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
 
@@ -102,9 +109,6 @@ _EVICT = text(
     """
 )
 _OWN = "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace(current_schema())"
-_TABLES = text(
-    f"SELECT oid::regclass::text {_OWN} AND relname NOT IN ('alembic_version', '{LOCK_TABLE}')"
-)
 _SCHEMA = text("SELECT current_schema(), quote_ident(current_schema())")
 _SIZE = text(f"SELECT coalesce(sum(pg_total_relation_size(oid)), 0) {_OWN}")
 _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
@@ -117,7 +121,7 @@ class PostgreSQLBackend(Backend):
         self._session = uuid.uuid4().hex
         self._url = url
         engine = _write_engine(url, lease_seconds, patience, self._session)
-        super().__init__(engine, database_url.safe(url))
+        super().__init__(engine, public_url(url))
         self._lease_seconds = lease_seconds
         self._patience = patience
 
@@ -220,17 +224,6 @@ class PostgreSQLBackend(Backend):
 
     def token(self) -> str:
         return f"{self._session}-{super().token()}"
-
-    @property
-    def needs_rest(self) -> bool:
-        return False
-
-    def vacuum(self) -> None:
-        with self.engine.connect() as connection:
-            tables = ", ".join(connection.execute(_TABLES).scalars())
-            connection.rollback()
-            alone = connection.execution_options(isolation_level="AUTOCOMMIT")
-            alone.exec_driver_sql(f"VACUUM (ANALYZE) {tables}")
 
     def evict(self) -> None:
         # In a short transaction of its own: it reads a table that an upgrade locks.

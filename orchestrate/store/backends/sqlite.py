@@ -15,22 +15,30 @@ from typing import Any
 from sqlalchemy import URL, Connection, Select, func, insert, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from orchestrate.store import database_url
-from orchestrate.store.backends.backups import back_up_to, copy_checked, rescue
-from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
-from orchestrate.store.backends.driver_errors import translated_file
-from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
-from orchestrate.store.backends.network_file_systems import refuse_unsafe
+from orchestrate.errors import DatabaseMovedError, StoreError, StoreUnavailableError
+from orchestrate.store.backends.base import (
+    Backend,
+    LaunchLife,
+    NewTrial,
+    back_up_to,
+    copy_checked,
+    public_url,
+    rescue,
+    sqlite_path,
+    translated_file,
+)
 from orchestrate.store.backends.sqlite_engine import (
+    LaunchLocks,
     driver_of,
     existing_path,
+    file_lock,
     read_address,
     read_engine,
+    refuse_unsafe,
     watcher,
     write_engine,
     writer,
 )
-from orchestrate.store.errors import DatabaseMovedError, StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, trial
 
@@ -48,7 +56,7 @@ class SQLiteBackend(Backend):
     """SQLite file, with its locks in the folder ``<file>-locks`` beside it."""
 
     def __init__(self, url: URL, patience: float) -> None:
-        self._path = database_url.sqlite_path(url)
+        self._path = sqlite_path(url)
         self._given = Path(str(url.database)).absolute()
         self._folder = _locks_folder(self._path)
         self._patience = patience
@@ -58,7 +66,7 @@ class SQLiteBackend(Backend):
         self._saved: Path | None = None
         self._checking = threading.RLock()
         engine = write_engine(self._connect, self._path, patience)
-        super().__init__(engine, database_url.safe(url))
+        super().__init__(engine, public_url(url))
         refuse_unsafe(self._path, self.safe_url)
         with translated_file(self.safe_url):
             if self._path.is_dir():
@@ -168,19 +176,6 @@ class SQLiteBackend(Backend):
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
 
-    @property
-    def needs_rest(self) -> bool:
-        return True
-
-    def vacuum(self) -> None:
-        self.check()
-        with self.engine.connect() as connection:
-            driver = driver_of(connection)
-            driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 1)  # the new file
-            driver.execute("VACUUM")
-            driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-            driver.execute(_TRUNCATE)
-
     def evict(self) -> None:
         """Do nothing: the kernel releases the locks of a dead process."""
 
@@ -262,8 +257,8 @@ def _insert_block(n: int) -> str:
 
 def dead(url: URL, _: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
     """Return the launches whose process is gone, for a reader."""
-    locks = LaunchLocks(_locks_folder(database_url.sqlite_path(url)))
-    with translated_file(database_url.safe(url)):
+    locks = LaunchLocks(_locks_folder(sqlite_path(url)))
+    with translated_file(public_url(url)):
         return [launch for launch in launches if not locks.is_held(launch.token)]
 
 

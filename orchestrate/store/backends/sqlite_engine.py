@@ -1,22 +1,232 @@
-"""Engines of SQLite files: writable with a write-ahead log, or read-only."""
+"""Engines of SQLite files: writable with a write-ahead log, or read-only; locks and file systems.
+
+Locks are locks of the kernel, which end with the process that holds them. The write-ahead log is
+shared memory, which one machine, or a virtual one and its host, cannot share with another
+(https://www.sqlite.org/wal.html), and the locks of many network file systems fail: SQLite is used
+on file systems that are known to be safe.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import re
 import sqlite3
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, cast
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple, cast
 from urllib.parse import quote
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.pool import QueuePool
 
-from orchestrate.store import database_url
-from orchestrate.store.backends.driver_errors import translated_file
-from orchestrate.store.backends.file_locks import patiently
-from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
+from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
+from orchestrate.store.backends.base import (
+    ANNOUNCE_SECONDS,
+    log,
+    public_url,
+    sqlite_path,
+    translated_file,
+)
 from orchestrate.store.schema import VIEWS
+
+MOUNT_TABLE = Path("/proc/self/mountinfo")
+
+SAFE_VARIABLE = "DOPT_SAFE_FILE_SYSTEMS"
+"""Environment variable with further kinds of file systems that its user knows to be safe."""
+
+_SAFE = frozenset(
+    {
+        *("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "bcachefs", "f2fs", "jfs", "nilfs2"),
+        *("reiserfs", "ufs", "apfs", "hfs", "hfsplus", "ubifs", "simfs"),
+        *("vfat", "msdos", "exfat", "ntfs", "ntfs3", "fuseblk", "udf", "iso9660", "squashfs"),
+        *("tmpfs", "ramfs", "devtmpfs", "rootfs", "overlay", "overlayfs", "aufs", "ecryptfs"),
+    }
+)
+"""File systems of disks and memory of this machine, and layers over them."""
+
+_LOCAL_PROGRAMS = frozenset(
+    {"mergerfs", "fuse-overlayfs", "bindfs", "ntfs-3g", "exfat", "gocryptfs", "encfs", "cryfs"}
+)
+"""Programs that serve a file system by FUSE from disks of this machine."""
+
+
+class Mount(NamedTuple):
+    """Mounted file system."""
+
+    folder: PurePosixPath
+    kind: str  # such as ext4, or fuse.sshfs
+
+
+def refuse_unsafe(path: Path, safe_url: str) -> None:
+    """Raise ``StoreError`` if the file of a database would be where SQLite is not known to be safe.
+
+    ``path`` is absolute, and neither it nor its folder has to exist. Where the system has no table
+    of mounts, nothing is refused.
+    """
+    try:
+        table = MOUNT_TABLE.read_text(errors="surrogateescape")
+    except OSError:
+        return
+    mount = mount_of(PurePosixPath(path), table)
+    if mount is not None and is_network(mount.kind):
+        raise StoreError(
+            f"The results database {safe_url} would be on {mount.folder}, whose file system "
+            f"({mount.kind}) is not known to keep the log and the locks of SQLite whole, so that "
+            "results can be lost or damaged, but a disk of this machine is expected: give a file "
+            "on one, such as store.url=sqlite:////var/tmp/results.db (in a container a volume, in "
+            "WSL a folder of Linux), and copy it afterwards, use PostgreSQL (store=postgresql), "
+            "which many machines share, or let each machine write a share of the grid to its own "
+            f"disk (store=shards). If you know that it is safe, set {SAFE_VARIABLE}={mount.kind}."
+        )
+
+
+def mount_of(path: PurePosixPath, table: str) -> Mount | None:
+    """Return the file system that holds an absolute path, given the text of ``mountinfo``.
+
+    It is the innermost one; of several at the same folder, the last one hides the others.
+    """
+    holding = None
+    for line in table.splitlines():
+        before, found, after = line.partition(" - ")
+        if not found:
+            continue
+        mount = Mount(PurePosixPath(_unescaped(before.split(" ")[4])), after.split(" ")[0])
+        if path.is_relative_to(mount.folder) and (
+            holding is None or len(mount.folder.parts) >= len(holding.folder.parts)
+        ):
+            holding = mount
+    return holding
+
+
+def is_network(kind: str) -> bool:
+    """Return whether a kind of file system is taken for one that several machines share.
+
+    Every kind is that is not known to be safe, and that ``DOPT_SAFE_FILE_SYSTEMS`` does not name.
+    """
+    system, _, program = kind.partition(".")
+    safe = program in _LOCAL_PROGRAMS if system == "fuse" else kind in _SAFE
+    return not safe and kind not in re.split(r"[,\s]+", os.environ.get(SAFE_VARIABLE, ""))
+
+
+def _unescaped(field: str) -> str:
+    r"""Return a field of the table with its octal codes, such as \040, as characters."""
+    return re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), field)
+
+
+LOCK_TABLE = Path("/proc/locks")
+
+_PAUSE_SECONDS = 0.02
+
+_held: weakref.WeakSet[LaunchLocks] = weakref.WeakSet()
+
+
+@contextmanager
+def file_lock(path: Path, patience: float) -> Iterator[None]:
+    """Hold the lock of a file, which is created if needed; wait as :func:`patiently` does."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+
+    def locked(seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while True:
+            with suppress(BlockingIOError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return True
+            if time.monotonic() >= end:
+                return False
+            time.sleep(_PAUSE_SECONDS)
+
+    try:
+        patiently(locked, patience, path, path)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def patiently(locked: Callable[[float], bool], patience: float, name: Path, path: Path) -> None:
+    """Call ``locked``, which waits for the given seconds and returns whether it has locked a file.
+
+    After two seconds a warning says who holds the lock of ``path``, and after ``patience`` seconds
+    ``StoreUnavailableError`` is raised.
+    """
+    first = min(ANNOUNCE_SECONDS, patience)
+    if locked(first):
+        return
+    log.warning("waiting for a lock of %s, which %s holds", name, holder(path))
+    if not locked(patience - first):
+        raise StoreUnavailableError(
+            f"The file {name} cannot be used: {holder(path)} has locked it for more than "
+            f"{patience:g} s; end it, and run the same command again."
+        )
+
+
+def holder(path: Path) -> str:
+    """Return the process that has locked a file for writing, as far as the kernel tells."""
+    with suppress(OSError):
+        inode = f":{path.stat().st_ino}"
+        for line in LOCK_TABLE.read_text().splitlines():
+            words = line.split()  # 1: POSIX ADVISORY WRITE 4711 08:01:131 120 120
+            if "->" not in words and "WRITE" in words and words[5].endswith(inode):
+                return f"process {words[4]}"
+    return "another process"
+
+
+class LaunchLocks:
+    """Set of locked files, one for each living launch of a database."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._descriptors: dict[str, int] = {}
+        _held.add(self)
+
+    def acquire(self, token: str) -> None:
+        """Create and lock the file of a new token."""
+        descriptor = os.open(self._path(token), os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._descriptors[token] = descriptor
+
+    def is_held(self, token: str) -> bool:
+        """Return whether a process, this one included, holds the lock."""
+        try:
+            descriptor = os.open(self._path(token), os.O_RDONLY)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
+
+    def release(self, token: str) -> None:
+        """Unlock and delete the file of a launch that has ended or died."""
+        self._path(token).unlink(missing_ok=True)
+        descriptor = self._descriptors.pop(token, None)
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def close(self) -> None:
+        """Release all locks; the files stay, so that other processes see the launches as dead."""
+        for descriptor in self._descriptors.values():
+            os.close(descriptor)
+        self._descriptors.clear()
+
+    def _path(self, token: str) -> Path:
+        return self._folder / f"launch-{token}"
+
+
+def _close_in_child() -> None:
+    # A forked worker shares the lock and would hold it after the death of the launch.
+    for locks in _held:
+        locks.close()
+
+
+os.register_at_fork(after_in_child=_close_in_child)
+
 
 BUSY_TIMEOUT_SECONDS = 30.0
 
@@ -42,12 +252,12 @@ def _reader(path: Path) -> sqlite3.Connection:
 
 def existing_path(url: URL) -> Path:
     """Return the path of a database; raise ``NoDatabaseError`` if there is no file."""
-    path = database_url.sqlite_path(url)
-    with translated_file(database_url.safe(url)):
+    path = sqlite_path(url)
+    with translated_file(public_url(url)):
         there = path.is_file()
     if not there:
         raise NoDatabaseError(
-            f"There is no results database at {database_url.safe(url)}: run a launch that writes "
+            f"There is no results database at {public_url(url)}: run a launch that writes "
             "it, or give the URL of another one (--db, or the variable DOPT_DB)."
         )
     return path
@@ -74,21 +284,6 @@ def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience
         patiently(locked, patience, path, path.with_name(f"{path.name}-shm"))
 
     return _engine(connect, begin)
-
-
-def filling_engine(path: Path) -> Engine:
-    """Return an engine for a new file that no other process reads, without a log and without syncs.
-
-    A file that is not complete after a crash must be deleted.
-    """
-
-    def connect() -> sqlite3.Connection:
-        connection = _connect(_address(path, "mode=rwc"))
-        connection.execute("PRAGMA journal_mode = OFF")
-        connection.execute("PRAGMA synchronous = OFF")
-        return connection
-
-    return _engine(connect, _begin)
 
 
 def _begin(connection: Connection) -> None:

@@ -17,8 +17,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
-from analysis.serve.app import create_app
-from analysis.serve.server import Server
+from analysis.serve.app import Server, create_app
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until
 

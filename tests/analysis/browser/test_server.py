@@ -29,7 +29,7 @@ from starlette.routing import Route
 
 from analysis.cli import main
 from analysis.serve import app, web
-from analysis.serve import server as serving
+from analysis.serve import app as serving
 from analysis.serve.app import create_app
 from analysis.serve.web import Cache, Database, Events, loss_text, plain, read_progress
 from orchestrate.store import Store
@@ -80,7 +80,7 @@ def test_a_port_that_is_taken_is_one_sentence(
 def test_without_its_libraries_it_says_which_to_install(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, "analysis.serve.server", raising=False)
+    monkeypatch.delitem(sys.modules, "analysis.serve.app", raising=False)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["serve"]) == 2
     assert "pip install 'dopt-exploration[serve]'" in capsys.readouterr().err

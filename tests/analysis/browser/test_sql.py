@@ -15,8 +15,7 @@ from sqlalchemy import Engine, make_url, text
 from starlette.testclient import TestClient
 
 from analysis.serve import sql
-from analysis.serve.app import create_app
-from analysis.serve.server import is_own
+from analysis.serve.app import create_app, is_own
 from analysis.serve.web import Database, ServerState
 from orchestrate.store import Store
 from orchestrate.store.schema import VIEWS

@@ -18,8 +18,8 @@ import pytest
 
 from dopt import SYSTEMS, Explorer, Plant, TrialSpec, encoder, unknown
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.explorer.flight import InFlight
 from dopt.explorer.refit import FitBeside, Found
+from dopt.explorer.state import InFlight
 from dopt.fitting.model import Layout, Model
 from dopt.learning import SimulationError
 from dopt.spec.scaled import learned_accelerations, scaled

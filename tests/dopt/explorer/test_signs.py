@@ -16,6 +16,7 @@ import dopt.explorer.explorer as module
 from analysis.serve.app import create_app
 from dopt import Explorer
 from dopt.explorer.signs import EXPLAINED, SIGNS, explained
+from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.types import Array
 from orchestrate.store import Reader
@@ -134,6 +135,17 @@ def test_states_beyond_the_limits_are_counted(caplog: pytest.LogCaptureFixture) 
         beyond = np.count_nonzero(np.abs(one.states[1:, 1]) > 0.5)
         assert one.counts["beyond"] == beyond > 0
     assert not any("beyond the limits" in text for text in said(caplog))
+
+
+def test_merged_samples_may_leave_parameters_until_the_next_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gaussian_process, "MOST_SAMPLES", 60)
+    model = {"name": "gaussian_process", "hyperparameters": "evidence"}
+    with explorer(model=model, learner={"name": "conditioning", "growth": 3.0}, steps=600) as one:
+        drive(one, 600, noise=0.1)
+        assert one.counts["refits"] > 0
+        assert one.counts["unmoved"] == 0
 
 
 def test_a_fit_damps_a_step_that_overshoots(

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt.fitting.derivatives import differentiated_text
+from dopt.fitting.model import differentiated_text
 from dopt.systems.expressions import compiled_text
 from dopt.types import Array
 

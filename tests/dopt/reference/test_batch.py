@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
 from dopt.reference.batch import Lockstep, run_trials
-from dopt.reference.planning import uniform_inputs
+from dopt.reference.models import uniform_inputs
 from tests.close import assert_close
 from tests.dopt.custom_networks import for_one
 from tests.dopt.reference.test_reference import situation, sphere, step_from

@@ -21,16 +21,14 @@ from dopt.randomness import draw
 from dopt.reference import batch as reference
 from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.models import (
+    SMALL,
+    BatchInformation,
     BatchModel,
+    d_optimal_inputs,
     gradients_and_changes,
     jacobian,
     model_function,
     network_function,
-)
-from dopt.reference.planning import (
-    SMALL,
-    BatchInformation,
-    d_optimal_inputs,
     planning_columns,
     quadratic_problem,
 )

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from analysis.film import Body, body
 from dopt.errors import SpecificationError
 from dopt.evaluation import simulate
-from dopt.geometry import Body, body
 from dopt.kernel.equations import compiled_equations
 from dopt.spec.custom_system import check_system
 from dopt.systems import (

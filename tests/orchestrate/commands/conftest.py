@@ -1,4 +1,4 @@
-"""A small grid with every status in it, its bundle, and commands run in this process."""
+"""A small grid with every status in it, and commands run in this process."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from orchestrate.__main__ import main
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
-from orchestrate.store.bundle import TABLES
 from tests.orchestrate.store.conftest import (  # noqa: F401  the same ones
     launch,
     open_store,
@@ -22,7 +19,7 @@ from tests.orchestrate.store.conftest import (  # noqa: F401  the same ones
     store,
     take,
 )
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
 
 SECRET = "hunter2"
 RECORD: LaunchRecord = replace(
@@ -34,13 +31,6 @@ TRACEBACK = (
     "    raise ZeroDivisionError\n"
     "ZeroDivisionError: seed {seed} is broken\n"
 )
-BUNDLE_FILES = [
-    *(f"{name}.parquet" for name in TABLES),
-    "README.md",
-    "provenance.json",
-    "views.sql",
-]
-ODD = np.array([-0.0, 5e-324, np.nextafter(1, 2), -1.7976931348623157e308])
 """Numbers that a conversion to text or to another type would change."""
 
 
@@ -118,29 +108,3 @@ def grid(store: Store) -> int:  # noqa: F811
 def ask(grid: int, command: Callable[..., Answer]) -> Callable[..., Answer]:  # noqa: ARG001
     """Return ``command`` on the database with the grid."""
     return command
-
-
-@pytest.fixture
-def bundle(
-    grid: int,
-    store: Store,  # noqa: F811
-    command: Callable[..., Answer],
-    tmp_path: Path,
-) -> Path:
-    """Return a bundle of the grid with every status, of assessments and of odd numbers."""
-    odd = result(20)
-    odd.states[:4, 0] = ODD
-    odd.inputs[:4, 1] = ODD
-    odd.loss[:3] = ODD[1:]  # SQLite itself stores -0.0 in a column of numbers as 0.0
-    odd.parameters[:4] = ODD
-    lost = diverged(3, seed=21)
-    lost.states[4:] = np.nan
-    specs = [Spec(20), Spec(21), Spec(22, width=8)]
-    claims = store.claim(grid, store.register(grid, specs).todo)
-    found = [replace(odd, best_loss=float(odd.loss.min())), lost, assessed(22)]
-    for claim, one in zip(claims, found, strict=True):
-        assert store.commit(claim, one, run_now())
-    out = tmp_path / "bundle"
-    answer = command("export", "bundle", str(out))
-    assert (answer.code, answer.err) == (0, "")
-    return out

@@ -171,7 +171,7 @@ class TestBackup:
         self, grid: int, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         if url.startswith("sqlite"):
-            monkeypatch.setattr("orchestrate.store.backends.backups.sqlite3.connect", short)
+            monkeypatch.setattr("orchestrate.store.backends.base.sqlite3.connect", short)
         else:
             said = "pg_dump: error: could not write to file: No space left on device"
             program = tmp_path / "bin" / "pg_dump"
@@ -291,35 +291,6 @@ class TestPrune:
         assert answer.code == 2
         assert message in answer.err
         assert everything(url) == before
-
-
-@on_both
-class TestVacuum:
-    def test_gives_space_back(self, ended: int, command: Run, url: str) -> None:
-        kept = everything(url)
-        text = 200_000 * "x"
-        execute(
-            url, f"INSERT INTO error (hash, type, message, traceback) VALUES ('', '', '', '{text}')"
-        )
-        execute(url, "DELETE FROM error WHERE hash = ''")
-        answer = command("vacuum", "--json")
-        assert answer.code == 0, answer.err
-        document = answer.document
-        assert ended
-        if url.startswith("sqlite"):
-            assert document["after"] < document["before"] - len(text) / 2
-        assert document["after"] > 0
-        assert everything(url) == kept
-
-    def test_waits_for_no_launch(self, grid: int, command: Run, url: str) -> None:
-        answer = command("vacuum")
-        if url.startswith("sqlite"):
-            assert answer.code == 2
-            assert f"Launch {grid} " in answer.err
-            assert "is running" in answer.err
-        else:
-            assert answer.code == 0
-            assert "bytes before" in answer.out
 
 
 def statuses(url: str) -> dict[str, str]:

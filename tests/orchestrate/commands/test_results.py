@@ -16,14 +16,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from dopt.result import Assessment
 from orchestrate.__main__ import main
 from orchestrate.commands import COMMANDS
 from orchestrate.commands.command import Command
-from orchestrate.commands.results import sparkline
 from orchestrate.errors import ExitCode
 from orchestrate.program import Parser
 from orchestrate.store import Store
@@ -107,7 +105,6 @@ def test_a_bad_request_is_one_sentence(words: list[str], hint: str, capsys: Capt
 CHANGING = [
     ["backup", "copy"],
     ["prune", "--yes", "--older-than", "1d"],
-    ["vacuum"],
     ["upgrade"],
     ["doctor"],
     ["work"],
@@ -428,23 +425,3 @@ def test_what_is_not_there_is_refused(ask: Run, words: list[str], hint: str) -> 
     answer = ask("show", *words)
     assert (answer.code, answer.out) == (2, "")
     assert hint in answer.err
-
-
-class TestSparkline:
-    def test_it_falls_on_a_logarithmic_scale(self) -> None:
-        assert sparkline([10.0**-i for i in range(8)]) == "█▇▆▅▄▃▂▁"
-
-    def test_it_has_at_most_so_many_columns(self) -> None:
-        assert len(sparkline(list(np.geomspace(1, 2, 1000)), columns=60)) == 60
-
-    def test_a_part_without_numbers_is_empty(self) -> None:
-        assert sparkline([1.0, 0.1, None, None]) == "█▁  "
-
-    @pytest.mark.parametrize("values", [[], [None, None]])
-    def test_without_numbers_there_is_none(self, values: list[None]) -> None:
-        assert sparkline(values) == ""
-
-    def test_equal_and_zero_losses_are_drawn(self) -> None:
-        assert sparkline([2.0, 2.0]) == "▁▁"
-        assert sparkline([0.0, 0.0]) == "▁▁"
-        assert sparkline([1.0, 0.0]) == "▁▁"

@@ -19,13 +19,11 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import main
 from orchestrate.commands import status
 from orchestrate.commands.command import plain
-from orchestrate.commands.results import grid_table
+from orchestrate.commands.results import Status, gather, grid_table
 from orchestrate.commands.status import watch
-from orchestrate.executors.base import Event, Task
-from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.executors.base import Event, InProcessExecutor, Task
 from orchestrate.fingerprint import fingerprint
 from orchestrate.program import UsageError, length_of_time, visible
-from orchestrate.queries import Status, gather
 from orchestrate.runner import worker
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import (

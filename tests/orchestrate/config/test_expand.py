@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from dopt.errors import SpecificationError
 from orchestrate.config import Combination
 from orchestrate.config.expand import expand
-from orchestrate.config.sweeps import parsed_overrides, read_axes
+from orchestrate.config.options import parsed_overrides, read_axes
 
 SAMPLE = Path(__file__).parent / "sample"
 SECTIONS = (

@@ -28,7 +28,7 @@ def shared_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     import ray
 
-    from orchestrate.executors.ray.connection import OwnRay
+    from orchestrate.executors.ray.executor import OwnRay
 
     start = OwnRay._init
 

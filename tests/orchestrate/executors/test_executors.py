@@ -21,11 +21,18 @@ from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
-from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
-from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.executors.base import (
+    EXECUTORS,
+    Event,
+    Executor,
+    InProcessExecutor,
+    Run,
+    Task,
+    TaskDone,
+    WorkerLost,
+)
 from orchestrate.executors.local import LocalExecutor
 from orchestrate.executors.lockstep import LockstepExecutor
-from orchestrate.executors.registry import EXECUTORS
 from orchestrate.program import exit_code
 from orchestrate.records import Failure
 from orchestrate.store import Reader
@@ -314,7 +321,8 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
 
 LAUNCH = """
 import json, sys
-from orchestrate.runner import launch, start
+from orchestrate.runner import start
+from orchestrate import launch
 from orchestrate.runner.run_grid import Work
 from tests.orchestrate.standins import quick
 
@@ -333,7 +341,7 @@ def test_each_executor_has_a_configuration_file() -> None:
 @pytest.mark.parametrize("name", ["local", "lockstep", "ray", "slurm"])
 def test_an_executor_is_named_in_its_own_files_and_the_registry_only(name: str) -> None:
     module = f"orchestrate.executors.{name}"
-    own = {f"orchestrate/executors/{name}.py", "orchestrate/executors/registry.py"}
+    own = {f"orchestrate/executors/{name}.py", "orchestrate/executors/base.py"}
     for path in (ROOT / "orchestrate").rglob("*.py"):
         file = str(path.relative_to(ROOT))
         if file in own or file.startswith(f"orchestrate/executors/{name}/"):
@@ -347,8 +355,8 @@ def test_an_executor_is_named_in_its_own_files_and_the_registry_only(name: str) 
 
 
 MINE = """
-from orchestrate.executors.inprocess import InProcessExecutor
-from orchestrate.executors.registry import ExecutorFactory
+from orchestrate.executors.base import InProcessExecutor
+from orchestrate.executors.base import ExecutorFactory
 
 given = []
 

@@ -19,16 +19,16 @@ from ray._private import services
 
 from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import WorkerLost
-from orchestrate.executors.ray import connection as ray_start
-from orchestrate.executors.ray.connection import (
+from orchestrate.executors.ray import executor as ray_start
+from orchestrate.executors.ray.executor import (
     SETTINGS_FILE,
+    RayExecutor,
     first_line,
     run_where_alike,
     setting_names,
     start,
     unreachable,
 )
-from orchestrate.executors.ray.executor import RayExecutor
 from orchestrate.fingerprint import fingerprint
 from orchestrate.store import Reader
 from tests.machines.hosts import unavailable

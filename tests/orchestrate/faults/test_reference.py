@@ -12,7 +12,8 @@ import pytest
 
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
-from orchestrate.runner import launch, start
+from orchestrate import launch
+from orchestrate.runner import start
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.faults.laboratory import Rows, flaws, results

@@ -16,14 +16,14 @@ from orchestrate.config import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.records import RunRecord
-from orchestrate.runner.chunks import (
+from orchestrate.runner.saving import RetryingStore
+from orchestrate.runner.scheduler import (
     BYTES_PER_GIB,
     MAX_CHUNK_TRIALS,
     Chunks,
     check_memory,
     memory_of_this_machine,
 )
-from orchestrate.runner.saving import RetryingStore
 from orchestrate.runner.worker import StoredChunks, trial_of
 from orchestrate.store import LaunchRecord, OpenConfig, Store
 from tests.orchestrate.faults.trials import outcome

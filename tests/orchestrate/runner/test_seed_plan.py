@@ -18,7 +18,8 @@ from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
-from orchestrate.runner.chunks import (
+from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.scheduler import (
     FEWEST_SEEDS,
     FEWEST_VALUES,
     MOST_LOOKS,
@@ -26,7 +27,6 @@ from orchestrate.runner.chunks import (
     is_narrow,
     looks,
 )
-from orchestrate.runner.run_grid import Work, launch_grid
 from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.standins import diverged, grid_of, quick
 

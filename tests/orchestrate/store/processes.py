@@ -16,11 +16,11 @@ from typing import Any
 import sqlalchemy
 
 from orchestrate.store import Claim, Store
+from orchestrate.store import maintenance as migration
 from orchestrate.store import merge as merge_source
 from orchestrate.store import merge as merging
-from orchestrate.store import upgrade as migration
+from orchestrate.store.maintenance import upgrade
 from orchestrate.store.merge import merge
-from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
 from tests.waiting import PATIENCE_SECONDS
 

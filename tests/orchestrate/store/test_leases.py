@@ -19,9 +19,9 @@ from orchestrate.executors.limits import Limits
 from orchestrate.records import Failure
 from orchestrate.runner.saving import Heartbeat
 from orchestrate.store import Reader, Store
-from orchestrate.store.backends.open import LEASE_SECONDS
 from orchestrate.store.doctor import examine
 from orchestrate.store.merge import Source, merge
+from orchestrate.store.store import LEASE_SECONDS
 from tests.dopt.trials import trial
 from tests.orchestrate.losses import lose
 from tests.orchestrate.store.databases import execute

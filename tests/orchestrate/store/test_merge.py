@@ -462,5 +462,5 @@ def test_an_array_that_is_damaged_is_a_sentence(
 ) -> None:
     fill_strangers(sqlite_url)
     execute(sqlite_url, "UPDATE trajectory SET states_shape = '[1]'")
-    assert main(["export", "trajectories", f"{tmp_path}/x.npz", "--db", sqlite_url]) == 2
+    assert main(["export", "trajectories", f"{tmp_path}/x.csv", "--db", sqlite_url]) == 2
     assert "An array of the database is damaged (cannot reshape" in capsys.readouterr().err

@@ -12,14 +12,13 @@ from pathlib import Path, PurePosixPath
 import pytest
 from sqlalchemy import make_url
 
+from orchestrate.errors import StoreError
 from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store
-from orchestrate.store.backends import network_file_systems, sqlite
-from orchestrate.store.backends.network_file_systems import is_network, mount_of
-from orchestrate.store.backends.open import make_backend
-from orchestrate.store.errors import StoreError
-from orchestrate.store.maintenance import vacuum
+from orchestrate.store.backends import sqlite, sqlite_engine
+from orchestrate.store.backends.sqlite_engine import is_network, mount_of
+from orchestrate.store.maintenance import upgrade
 from orchestrate.store.merge import merge
-from orchestrate.store.upgrade import upgrade
+from orchestrate.store.store import make_backend
 from tests.orchestrate.store.databases import file_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
 
@@ -184,7 +183,6 @@ WRITERS: dict[str, Callable[[Store, int, list[Claim]], object]] = {
     "prune": lambda store, *_: store.prune([SPECS[0].trial_key]),
     "save": lambda store, launch, _: store.save(launch, Spec(60), result(), RUN),
     "holds_more": lambda store, *_: store.holds_more(Spec(60), result()),
-    "vacuum": lambda store, *_: store._backend.vacuum(),
     "check": lambda store, *_: store.check(),
 }
 
@@ -200,14 +198,14 @@ def test_every_writer_notices(writer: str, url: str, folder: Path, other: Path) 
     assert file_of(url).read_bytes() == other.read_bytes()
 
 
-@pytest.mark.parametrize("command", ["merge", "upgrade", "vacuum"])
+@pytest.mark.parametrize("command", ["merge", "upgrade"])
 def test_a_command_notices(
     command: str, url: str, folder: Path, other: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Store.open(url).close()
     kept = other.read_bytes()
     remember = sqlite.SQLiteBackend._remember
-    calls = {"merge": 2, "upgrade": 1, "vacuum": 1}
+    calls = {"merge": 2, "upgrade": 1}
 
     def lost(backend: sqlite.SQLiteBackend) -> None:
         remember(backend)
@@ -219,7 +217,6 @@ def test_a_command_notices(
     commands: dict[str, Callable[[], object]] = {
         "merge": lambda: merge(url, f"sqlite:///{other}"),
         "upgrade": lambda: upgrade(url, backup=False),
-        "vacuum": lambda: vacuum(url),
     }
     with pytest.raises(DatabaseMovedError, match="replaced by another file"):
         commands[command]()
@@ -354,7 +351,7 @@ def test_a_database_on_a_network_is_refused_before_anything_is_written(
 ) -> None:
     table = tmp_path / "mountinfo"
     table.write_text(f"{ROOT}60 29 0:50 / {tmp_path}/home rw - nfs4 nas:/home rw\n")
-    monkeypatch.setattr(network_file_systems, "MOUNT_TABLE", table)
+    monkeypatch.setattr(sqlite_engine, "MOUNT_TABLE", table)
     (tmp_path / "link").symlink_to(tmp_path / "home", target_is_directory=True)
     url = make_url(f"sqlite:///{tmp_path}/link/results/results.db")
     with pytest.raises(StoreError, match=r"home, whose file system \(nfs4\).*store=postgresql"):
@@ -366,5 +363,5 @@ def test_a_database_on_a_network_is_refused_before_anything_is_written(
 def test_nothing_is_refused_where_there_is_no_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(network_file_systems, "MOUNT_TABLE", tmp_path / "none")
+    monkeypatch.setattr(sqlite_engine, "MOUNT_TABLE", tmp_path / "none")
     make_backend(make_url(f"sqlite:///{tmp_path}/results.db")).close()

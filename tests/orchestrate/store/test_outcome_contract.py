@@ -23,9 +23,9 @@ from orchestrate.store import (
     StoreUnavailableError,
 )
 from orchestrate.store.doctor import examine
+from orchestrate.store.maintenance import upgrade
 from orchestrate.store.records import DTYPE, finite_list, pack, unpack, utc_text
 from orchestrate.store.schema import STEP_VALUES
-from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.databases import execute
 from tests.orchestrate.store.fakes import (
     HORIZON,

@@ -21,8 +21,8 @@ from sqlalchemy import Engine, create_engine, text
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
-from orchestrate.store.backends import base, file_locks, postgresql
-from orchestrate.store.backends.transient_errors import is_transient
+from orchestrate.store.backends import base, postgresql, sqlite_engine
+from orchestrate.store.backends.base import is_transient
 from orchestrate.store.records import Array
 from tests.orchestrate.store.databases import execute, file_of, schema_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
@@ -205,7 +205,7 @@ ROW = "SELECT * FROM launch FOR UPDATE"
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Announce a wait after a fraction of the two seconds."""
-    for module in (base, file_locks, postgresql):
+    for module in (base, sqlite_engine, postgresql):
         monkeypatch.setattr(module, "ANNOUNCE_SECONDS", 0.2)
     monkeypatch.setattr(postgresql, "_WATCH_SECONDS", 0.05)
 
@@ -360,7 +360,7 @@ def test_a_free_file_is_locked_at_once(
         taken.append(seconds)
         return True
 
-    file_locks.patiently(locked, patience, tmp_path, tmp_path)
+    sqlite_engine.patiently(locked, patience, tmp_path, tmp_path)
     assert taken == [min(0.2, patience)]
     assert not warnings(caplog)
 

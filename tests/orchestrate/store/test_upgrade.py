@@ -20,10 +20,10 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store import upgrade as migration
-from orchestrate.store.backends.file_locks import LaunchLocks
+from orchestrate.store import maintenance as migration
+from orchestrate.store.backends.sqlite_engine import LaunchLocks
+from orchestrate.store.maintenance import upgrade
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
-from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.conftest import each_version
 from tests.orchestrate.store.databases import (
     backups,
@@ -279,7 +279,7 @@ def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.Mon
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orchestrate.store.backends.backups.os.fsync", full)
+    monkeypatch.setattr("orchestrate.store.backends.base.os.fsync", full)
     with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
         upgrade(sqlite_url)
     assert structure(sqlite_url) == before

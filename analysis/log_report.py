@@ -1,0 +1,535 @@
+"""Recorded runs: reading of files, ``python -m analysis log FILE`` and ``fit PLANT LOG…``.
+
+Files are CSV, Parquet, MAT and HDF5. The health of a run is one line a fact, with a picture; a fit
+has a report, a picture and a model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from analysis.data.matching import AnalysisError
+from analysis.log_health import FEW, MOST_ROWS, Effect, Health, Signal, examine
+from analysis.style import number
+from dopt.errors import given_path, install_command
+from dopt.log import CLOCKS, TURN, Log
+from dopt.systems.plant import Plant
+from orchestrate.program import UsageError, path, positive, tell
+from orchestrate.store import Store
+
+INPUTS = re.compile(
+    r"^u\d*$|input|volt|torque|^tau|current|pwm|force|throttle|command|(^|_)cmd($|_|\d)",
+    re.IGNORECASE,
+)
+"""Columns that are taken for inputs where none are named."""
+
+_COMMANDED = re.compile(r"con|cmd|command|des|ref", re.IGNORECASE)
+_MEASURED = re.compile(r"meas", re.IGNORECASE)
+
+
+def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """Return the table in a file, by the ending of its name.
+
+    ``.csv`` and ``.csv.gz`` have a line of names; ``.parquet``; ``.mat`` of MATLAB, 7.3 included;
+    ``.h5`` or ``.hdf5``. In the last two, variables of one length are columns, and those in a
+    structure or a group are ``group.name``.
+
+    Raises
+    ------
+    AnalysisError
+        If the file is missing, has another ending, or holds no such table.
+    """
+    file = given_path(path, "the file of a log", AnalysisError)
+    ending = next((one for one in _READERS if file.name.lower().endswith(one)), None)
+    if ending is None:
+        raise AnalysisError(
+            f"{file} ends with {file.suffix or 'nothing'}, but a log is read from "
+            f"{', '.join(_READERS)}: convert it, or give its columns to dopt.Log."
+        )
+    if not file.is_file():
+        raise AnalysisError(f"{file} is no file, but the file of a log is expected: correct it.")
+    try:
+        table = _READERS[ending](file)
+    except (ValueError, EOFError, OSError) as error:  # of each of the libraries
+        raise AnalysisError(
+            f"{file} cannot be read ({error}), but a table by its ending {ending} is expected: "
+            f"export it again."
+        ) from error
+    if table.empty:
+        raise AnalysisError(f"{file} has no rows, but a recorded run is expected: give another.")
+    return table
+
+
+def read_log(
+    path: str | os.PathLike[str],
+    *,
+    states: Sequence[str] | Mapping[str, str] | None = None,
+    inputs: Sequence[str] | Mapping[str, str] | None = None,
+    **options: Any,
+) -> Log:
+    """Return the log in a file.
+
+    Columns named like an input, such as u, voltage, torque or tau1, are the inputs unless they are
+    given, and the others are the states, except for stamps and flags.
+
+    Parameters
+    ----------
+    path : str or path
+        File that :func:`read_table` reads.
+    states, inputs, **options
+        As of :class:`dopt.Log`.
+    """
+    return log_of(read_table(path), states, inputs, **options)
+
+
+def log_of(
+    table: pd.DataFrame,
+    states: Sequence[str] | Mapping[str, str] | None = None,
+    inputs: Sequence[str] | Mapping[str, str] | None = None,
+    **options: Any,
+) -> Log:
+    """Return a log of a table, with the columns that are named like inputs for those."""
+    table = table.rename(columns=str)
+    inputs = _guessed_inputs(table) if inputs is None else inputs
+    if not inputs:
+        raise AnalysisError(
+            f"none of the columns {', '.join(map(str, table))} is named like an input (u, voltage, "
+            f"torque, tau1, ...), but at least one input is expected: name it (inputs=, --inputs)."
+        )
+    if states is None:
+        named = inputs.values() if isinstance(inputs, Mapping) else inputs
+        taken = {*named, options["time"]} if isinstance(options.get("time"), str) else {*named}
+        states = [
+            one
+            for one in map(str, table)
+            if one not in taken and one.lower() not in CLOCKS
+            if not is_flag(table[one]) and not INPUTS.search(one)
+        ]
+    return Log(table, states=states, inputs=inputs, **options)
+
+
+def is_flag(values: pd.Series[Any]) -> bool:
+    """Return whether a column is a flag: nothing but −1, 0 and 1, or truth values."""
+    return bool(values.dtype.kind in "biu" and values.isin([-1, 0, 1]).all())
+
+
+def _guessed_inputs(table: pd.DataFrame) -> list[str]:
+    """Return columns named like inputs; of commanded and measured ones the measured."""
+    found = [str(one) for one in table if INPUTS.search(str(one))]
+    measured = [one for one in found if _MEASURED.search(str(one))]
+    rest = [one for one in found if one not in measured]
+    return measured if measured and all(_COMMANDED.search(str(one)) for one in rest) else found
+
+
+def _csv(file: Path) -> pd.DataFrame:
+    table = pd.read_csv(file, skipinitialspace=True)
+    if table.shape[1] == 1 and ";" in str(table.columns[0]):
+        raise ValueError("its columns are separated by ';', not by ','")
+    return table
+
+
+def _mat(file: Path) -> pd.DataFrame:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        found = loadmat(file, simplify_cells=True)
+    except NotImplementedError:  # of version 7.3
+        return _hdf5(file)
+    except MatReadError as error:
+        raise ValueError(error) from error
+    return _of_variables(file, {k: v for k, v in found.items() if not k.startswith("__")})
+
+
+def _hdf5(file: Path) -> pd.DataFrame:
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise AnalysisError(
+            f"{file} is in the format HDF5, which needs the library h5py: install it with "
+            f"{install_command('logs')}."
+        ) from error
+    found: dict[str, Any] = {}
+
+    def take(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and not name.startswith("#"):
+            found[name.replace("/", ".")] = item[()]
+
+    with h5py.File(file) as opened:
+        opened.visititems(take)
+    return _of_variables(file, found)
+
+
+def _of_variables(file: Path, variables: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the variables of the commonest length as columns."""
+    arrays = dict(_flattened(variables))
+    columns: dict[str, np.ndarray[Any, Any]] = {}
+    for name, array in arrays.items():
+        if array.ndim == 2 and array.shape[0] < array.shape[1]:
+            array = array.T
+        if array.ndim == 2 and array.shape[1] > 1:
+            columns |= {f"{name}{i + 1}": array[:, i] for i in range(array.shape[1])}
+        elif array.size > 1 and array.dtype.kind in "fiubM":
+            columns[name] = array.ravel()
+    lengths = [len(column) for column in columns.values()]
+    rows = max(set(lengths), key=lengths.count, default=0)
+    if lengths.count(rows) < 2 or lengths.count(rows) < len(lengths) / 2:
+        shown = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise AnalysisError(
+            f"{file} holds {shown or 'no arrays'}, but variables of one length are expected of a "
+            f"log: give the ones of one run to dopt.Log."
+        )
+    return pd.DataFrame({name: one for name, one in columns.items() if len(one) == rows})
+
+
+def _flattened(found: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in found.items():
+        if isinstance(value, Mapping):
+            yield from _flattened(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", np.asarray(value)
+
+
+_READERS: dict[str, Callable[[Path], pd.DataFrame]] = {
+    ".csv": _csv,
+    ".csv.gz": _csv,
+    ".parquet": pd.read_parquet,
+    ".mat": _mat,
+    ".h5": _hdf5,
+    ".hdf5": _hdf5,
+}
+
+
+HELP = "how healthy a recorded run is: sampling, noise, limits, delay, feedback, units"
+
+PICTURES = (".png", ".pdf", ".svg")
+
+RESTS = 0.2
+"""Share of a log at rest from which the report says so."""
+
+UNEVEN = 0.05
+"""Share of irregular steps from which the report says that effects do not heed them."""
+
+_MANY_TURNS = 100.0  # radians
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the file and the options of the command."""
+    command.add_argument("file", metavar="FILE", help=".csv, .csv.gz, .parquet, .mat or .h5")
+    for option, what in (
+        ("--states", "measured states, such as th or angle=th,rate=om (all other columns)"),
+        ("--inputs", "inputs, such as u or voltage=u (columns that are named like inputs)"),
+        ("--angles", "states in radians that are angles: unwrapped (none)"),
+        ("--units", "units of columns, such as t=ms,th=counts/4096"),
+    ):
+        command.add_argument(option, help=what)
+    command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
+    for option, what in (("--dt", "seconds between two rows without stamps"), ("--gap", "s")):
+        help_text = what if option == "--dt" else "longest step within a piece [s] (10 medians)"
+        command.add_argument(option, type=positive(option, float), help=help_text)
+    command.add_argument("--out", type=path("--out"), help="picture (figures/NAME.png)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the report of a log and save its picture."""
+    target = options.out or Path("figures") / f"{Path(options.file).name.split('.')[0]}.png"
+    if target.suffix not in PICTURES:
+        raise UsageError(
+            f"--out is {str(target)!r}, but a name with one of the endings {', '.join(PICTURES)} "
+            f"is expected: give one."
+        )
+    table = read_table(options.file).rename(columns=str)
+    log = log_of(
+        table,
+        names_of("--states", options.states),
+        names_of("--inputs", options.inputs),
+        time=options.time,
+        dt=options.dt,
+        gap=options.gap,
+        angles=tuple(names_of("--angles", options.angles) or ()),
+        units=names_of("--units", options.units),
+    )
+    health, file = examine(log), Path(options.file)
+    guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
+    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table)):
+        tell(sys.stdout, f"{line}\n")
+    from analysis.figures.reports import draw_log  # Matplotlib: other commands do without it
+
+    draw_log(log, health, target, file.name)
+    tell(sys.stdout, f"picture: {target}\n")
+    return 0
+
+
+def names_of(option: str, text: str | None) -> dict[str, str] | None:
+    """Return the columns that an option names, by state or input."""
+    if text is None:
+        return None
+    found = {}
+    for part in text.split(","):
+        name, equals, column = (one.strip() for one in part.partition("="))
+        if not name or (equals and not column) or (option == "--units" and not equals):
+            raise UsageError(
+                f"{option} is {text!r}, but names that commas separate are expected, such as "
+                f"{'th=deg' if option == '--units' else 'th or angle=th'}: correct it."
+            )
+        found[name] = column or name
+    return found
+
+
+def lines(log: Log, health: Health, table: pd.DataFrame) -> Iterator[str]:
+    """Yield the sentences of the report: sampling, signals, inputs, suspicions, notes."""
+    yield f"sampling: {_sampling(log, health)}"
+    for one in health.states:
+        yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
+        yield from _units(one)
+    for one in health.inputs:
+        yield f"{one.name}: {_signal(one)}{_limits(one)}"
+    wrapped = [one.name for one in health.states if not math.isnan(one.period)]
+    if wrapped:
+        yield f"effects of the inputs: not judged while {', '.join(wrapped)} wraps"
+    else:
+        yield from (line for effect in health.effects for line in _effect(effect, health))
+    if health.effects and health.irregular > UNEVEN:
+        yield "effects of the inputs: as if all steps were of the median length"
+    unseen = {*log.inputs} - {effect.input for effect in health.effects}
+    yield from (f"{name}: constant, or too few rows to see its effect" for name in sorted(unseen))
+    yield from _rest(log, health)
+    if log.n_rows > MOST_ROWS:
+        yield f"effects of the inputs: of the first {MOST_ROWS:,} rows"
+    yield from _others(log, table)
+    yield from (f"note: {note}" for note in log.notes)
+
+
+def _sampling(log: Log, health: Health) -> str:
+    unit, scale = ("ms", 1e3) if health.step < 1 else ("s", 1.0)
+    shown = [number(scale * one) for one in (health.step, health.shortest, health.longest)]
+    text = f"median step {shown[0]} {unit}, {shown[1]} to {shown[2]} {unit}"
+    if shown[1] == shown[2]:
+        text = f"every {shown[0]} {unit}"
+    if health.irregular > 0:
+        text += f", {100 * health.irregular:.2g} % of the steps off by more than 20 %"
+    text += f", {len(log.pieces)} piece{'s' * (len(log.pieces) > 1)} without gaps"
+    if health.step >= 1:
+        likely = "ms" if health.step < 1e3 else "us" if health.step < 1e6 else "ns"
+        text += (
+            f"; stamps in {likely}? A step of {number(health.step)} s is long: --units t={likely}"
+        )
+    return text
+
+
+def _signal(one: Signal) -> str:
+    text = f"{number(one.low)} to {number(one.high)}"
+    if one.levels < FEW:
+        return f"{text}, {one.levels} level{'s' * (one.levels > 1)}"
+    if math.isnan(one.quantum):
+        return f"{text}, no steps"
+    turn = TURN / one.quantum
+    whole = abs(turn - round(turn)) < 1e-3 * max(1.0, turn / 1000) and turn > 50
+    return f"{text}, steps of {one.quantum:.6g}{f' ({round(turn):,} a turn)' * whole}"
+
+
+def _limits(one: Signal) -> str:
+    rows = [
+        f"{count:,} rows at {number(end)}"
+        for count, end in ((one.at_low, one.low), (one.at_high, one.high))
+        if count
+    ]
+    return f", saturated: {' and '.join(rows)}" if rows else ", not saturated"
+
+
+def _units(one: Signal) -> Iterator[str]:
+    """Yield what a state's values say of its unit."""
+    span = one.high - one.low
+    whole = one.quantum == round(one.quantum, 6) and one.quantum >= 1
+    if not math.isnan(one.period):
+        unit = {1.0: "rev", TURN: "rad", 360.0: "deg"}.get(one.period, f"counts/{one.period:.0f}")
+        words = {"rad": "name it in --angles"}.get(unit, f"--angles and --units {one.name}={unit}")
+        yield f"{one.name}: wraps about every {one.period:.6g}: an angle in {unit}? {words}"
+    elif whole and span > 50:
+        yield (
+            f"{one.name}: whole numbers over {span:.6g}: degrees, or counts of an encoder? "
+            f"--units {one.name}=deg or {one.name}=counts/N"
+        )
+    elif span > _MANY_TURNS and not math.isnan(one.quantum):
+        yield (
+            f"{one.name}: {span / TURN:.3g} turns if it is an angle in radians; degrees? "
+            f"--units {one.name}=deg"
+        )
+
+
+def _effect(effect: Effect, health: Health) -> Iterator[str]:
+    told = 100 * (1 - effect.open)
+    pair = f"{effect.input} on {effect.state}"
+    if effect.follows_state:
+        yield (
+            f"{effect.input}: this input explains nothing here: it follows the measured state "
+            f"(R² = {told / 100:.3f}), so that a fit learns this law and not the plant"
+        )
+    elif effect.explains_nothing:
+        yield (
+            f"{effect.input}: this input explains nothing here: it varies on its own, but its "
+            f"effect is {effect.steadiness:.1f} standard errors; motor off, or the wrong column?"
+        )
+    elif not effect.has_effect:
+        yield f"{effect.input}: effect not told apart: the state tells {told:.0f} % of this input"
+    else:
+        yield (
+            f"{pair}: explains {100 * effect.explained.max():.0f} % of the acceleration that "
+            f"the state leaves open ({effect.steadiness:.0f} standard errors)"
+        )
+    if effect.delays is None:
+        yield f"{pair}: delay not told apart"
+    else:
+        first, last = (max(0, one) for one in effect.delays)
+        samples = f"{first}" if first == last else f"{first} to {last}"
+        step = number(1e3 * health.step)
+        about = "; about, as noise is fed back" * effect.closed_loop
+        yield f"{pair}: suspected delay: {samples} sample{'s' * (last != 1)} of {step} ms{about}"
+    if effect.follows_state:
+        yield f"{effect.input}: closed loop, or as regular as the motion: a function of the state"
+    elif effect.closed_loop:
+        yield (
+            f"{effect.input}: closed loop: measurements explain {100 * effect.feedback:.0f} % of "
+            f"what its own past leaves open"
+        )
+    else:
+        yield f"{effect.input}: open loop, as far as can be seen"
+
+
+def _rest(log: Log, health: Health) -> Iterator[str]:
+    """Yield where nothing moves, and whether an input acts there."""
+    rests = health.resting
+    if rests.mean() < RESTS:
+        return
+    bounds = np.flatnonzero(np.diff(np.r_[False, rests, False].astype(int)))
+    longest = int(np.diff(bounds)[::2].max())
+    applied = np.abs(np.concatenate([piece.inputs for piece in log.pieces]))
+    blocks = np.array_split(applied, len(rests))
+    most = np.max([block.max(axis=0) for block, rest in zip(blocks, rests, strict=True) if rest], 0)
+    acts = ", ".join(
+        f"|{name}| up to {number(value)}" for name, value in zip(log.inputs, most, strict=True)
+    )
+    yield (
+        f"rest: nothing moves in {100 * rests.mean():.0f} % of the log, in {longest} % of it on "
+        f"end, with {acts} there: dry friction, held or without power; little is learned there"
+    )
+
+
+def _others(log: Log, table: pd.DataFrame) -> Iterator[str]:
+    """Yield the columns that are neither states nor inputs."""
+    used = {*log.states, *log.inputs}
+    for name in table:
+        values = table[name]
+        if is_flag(values) and name not in used:
+            yield f"{name}: a flag, not 0 in {int((values != 0).sum()):,} rows"
+
+
+FIT_HELP = "fit a plant's unknown constants and a network to recorded runs: report, picture, model"
+
+
+def add_fit_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the files and the options of the command."""
+    command.add_argument("plant", metavar="PLANT", help="the arguments of dopt.Plant (.yaml)")
+    command.add_argument(
+        "logs", metavar="LOG", nargs="+", help=".csv, .csv.gz, .parquet, .mat, .h5"
+    )
+    command.add_argument("--validate", metavar="LOG", nargs="+", default=(), help="other runs")
+    command.add_argument("--columns", help="columns, such as angle=th,voltage=u (the same names)")
+    command.add_argument("--units", help="units of columns, such as t=ms,th=counts/4096")
+    command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
+    command.add_argument("--width", type=int, default=16, help="units of the network, 0: none (16)")
+    command.add_argument(
+        "--hold", choices=("zero", "linear"), default="zero", help="input between two rows (zero)"
+    )
+    command.add_argument("--window", type=positive("--window", float), help="window [s] (chosen)")
+    command.add_argument("--out", type=path("--out"), default="fit", help="folder (fit/)")
+    command.add_argument(
+        "--db",
+        metavar="URL",
+        help="database that stores the fit, such as sqlite:///results.db (no database)",
+    )
+
+
+def run_fit(options: argparse.Namespace) -> int:
+    """Fit, print the report, save the picture and the model, and store the fit where asked."""
+    import dopt
+
+    if options.db:
+        Store.open(options.db).close()  # before minutes of fitting
+    plant = read_plant(options.plant)
+    given = {
+        "columns": names_of("--columns", options.columns),
+        "units": names_of("--units", options.units),
+        "time": options.time,
+    }
+    logs = [_log(file, plant, given) for file in options.logs]
+    tests = [_log(file, plant, given) for file in options.validate]
+    found = dopt.fit(
+        plant,
+        logs,
+        validate=tests or None,
+        width=options.width,
+        hold=options.hold,
+        window=options.window,
+        progress=lambda text: tell(sys.stderr, f"{text}\n"),
+    )
+    tell(sys.stdout, f"{found.report()}\n")
+    from analysis.figures.reports import draw_fit  # Matplotlib: other commands do without it
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    draw_fit(found, (tests or logs)[0], options.out / "fit.png")
+    found.save(options.out / "model.npz")
+    tell(sys.stdout, f"picture: {options.out / 'fit.png'}\nmodel: {options.out / 'model.npz'}\n")
+    if options.db:
+        tell(sys.stdout, f"trial: {found.store(options.db)}\n")
+    return 0
+
+
+def read_plant(file: str) -> Plant:
+    """Return the plant that a YAML file declares.
+
+    An unknown number is ``{value: 25, factor: 2}`` or ``{value: 0, spread: 0.1}``, an encoder
+    ``{counts: 2048}``.
+
+    Raises
+    ------
+    AnalysisError
+        If the file cannot be read, or is no mapping.
+    SpecificationError
+        If the plant is not as :class:`dopt.Plant` says.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError  # type: ignore[import-untyped]  # which has no types
+
+    source = given_path(file, "the file of a plant", AnalysisError)
+    try:
+        section: Any = OmegaConf.to_container(OmegaConf.load(source), resolve=True)
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        raise AnalysisError(
+            f"{source} cannot be read ({error}), but the arguments of dopt.Plant in YAML are "
+            f"expected: correct it."
+        ) from error
+    if not isinstance(section, dict):
+        raise AnalysisError(
+            f"{source} holds a {type(section).__name__}, but the arguments of dopt.Plant by their "
+            f"names are expected, such as 'dt: 0.01': correct it."
+        )
+    return Plant.from_mapping(section)
+
+
+def _log(file: str, plant: Plant, given: dict[str, Any]) -> Log:
+    log = Log.for_plant(read_table(file).rename(columns=str), plant, **given)
+    for note in log.notes:
+        tell(sys.stderr, f"{Path(file).name}: {note}\n")
+    return log

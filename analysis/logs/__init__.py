@@ -1,1 +1,0 @@
-"""Recorded runs: reading, and a report of their health."""

@@ -1,1 +1,0 @@
-"""Results as files: tables, matrices, and bundles of all tables."""
