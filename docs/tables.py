@@ -27,12 +27,13 @@ from analysis.stats.intervals import band, standard_error
 from analysis.stats.scores import compare
 from analysis.style import number, plus_minus, share, within
 from studies.conclusions import tables as conclusions
+from studies.robots import tables as robots
 
 DOCS = Path(__file__).parent
 PAGES = (
     "compiled_plugins.md", "conclusions.md", "database.md", "figures.md", "findings.md",
-    "method.md", "options.md", "plants.md", "structure.md", "tutorial.md", "wide_networks.md",
-    "yardsticks.md", "../README.md",
+    "method.md", "options.md", "plants.md", "robots.md", "structure.md", "tutorial.md",
+    "wide_networks.md", "yardsticks.md", "../README.md",
 )  # fmt: skip
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")
@@ -504,7 +505,8 @@ TABLES: dict[str, Callable[[], str]] = {
     )
 }  # fmt: skip
 TABLES |= code_tables.TABLES
-TABLES |= {made.__name__: made for made in (*conclusions.TABLES, *conclusions.OTHERS)}
+MORE = (*conclusions.TABLES, *conclusions.OTHERS, *robots.TABLES)
+TABLES |= {made.__name__: made for made in MORE}
 
 
 def with_tables(text: str) -> str:

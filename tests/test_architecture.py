@@ -32,11 +32,12 @@ ONLY_IN = {
     "torch": ("dopt/reference/", "dopt/fitting/export.py", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/", "dopt/fitting/"),
     "gymnasium": ("dopt/gymnasium.py", "dopt/fitting/export.py"),
-    "mujoco": ("dopt/systems/mujoco.py",),
+    "mujoco": ("dopt/systems/mujoco.py", "dopt/robots/"),
     "matplotlib": (
         "analysis/figures/",
         "analysis/outputs.py",
         "analysis/film.py",
+        "orchestrate/commands/design.py",
     ),
     "starlette": ("analysis/serve/",),
     "uvicorn": ("analysis/serve/",),

@@ -5,7 +5,7 @@ A new command is a :class:`~orchestrate.commands.command.Command` and a line in 
 
 from __future__ import annotations
 
-from orchestrate.commands import export, maintenance, results, status
+from orchestrate.commands import design, export, maintenance, results, status
 from orchestrate.commands.command import Command
 
 COMMANDS: tuple[Command, ...] = (
@@ -20,5 +20,6 @@ COMMANDS: tuple[Command, ...] = (
     maintenance.UPGRADE_COMMAND,
     maintenance.BACKUP_COMMAND,
     maintenance.PRUNE_COMMAND,
+    design.DESIGN_COMMAND,
 )
 """In the order in which the help shows them."""

@@ -40,23 +40,27 @@ class Command:
         with exit code 75 for ``StoreUnavailableError`` and 2 for the others.
     add_arguments
         Adds the arguments of the command, beside ``--db`` and ``--json``.
+    needs_database
+        Whether the command has ``--db``.
     """
 
     name: str
     help: str
     run: Callable[[argparse.Namespace], ExitCode]
     add_arguments: Callable[[argparse.ArgumentParser], None] = lambda _: None
+    needs_database: bool = True
 
     def parser(self) -> Parser:
         """Return the parser of the arguments after the name of the command."""
         parser = Parser(prog=f"{PROGRAM} {self.name}", description=self.help)
         self.add_arguments(parser)
-        parser.add_argument(
-            "--db",
-            metavar="URL",
-            default=default_url(),
-            help=f"database (default: the variable {URL_VARIABLE}, else {DEFAULT_URL})",
-        )
+        if self.needs_database:
+            parser.add_argument(
+                "--db",
+                metavar="URL",
+                default=default_url(),
+                help=f"database (default: the variable {URL_VARIABLE}, else {DEFAULT_URL})",
+            )
         parser.add_argument("--json", action="store_true", help="print one JSON document")
         return parser
 

@@ -1,0 +1,422 @@
+"""Design of excitation trajectories, and the share of the attainable information that each has.
+
+The criterion is D_s: the log determinant of the covariance of the requested parameters, in relative
+units, with a prior standard deviation of 1 for every parameter; what is unknown and not requested
+counts as such. A penalty keeps every error near or below its median over random multisines. The
+bound is by J. Kiefer and J. Wolfowitz, "The equivalence of two extremum problems", Can. J. Math. 12
+(1960): no motion has more information than the best measure over all states within the limits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Self
+
+import numpy as np
+
+from dopt.arguments import whole
+from dopt.errors import SpecificationError
+from dopt.robots.body import Body, Motion
+from dopt.robots.limits import Limits
+from dopt.robots.parameters import Identifiability, Parameter, Unknowns, relative_errors
+from dopt.robots.trajectories import Family, Fourier, Ladder, Multisine
+from dopt.types import Array
+
+COARSE = 0.04
+"""Time between the rows of a motion while it is searched [s]."""
+
+FINE = 0.01
+"""Time between the rows of a motion whose torques and collisions are checked at the end [s]."""
+
+REFERENCES = 25
+"""Random multisines, whose median errors every design is compared with."""
+
+PERIODS = (2.0, 5.0, 10.0, 20.0)
+"""Periods of the Fourier series that are tried [s]."""
+
+BEGUN, CHANGED, KEPT = 24, (0.03, 0.1, 0.3), 0.7
+"""Motions that begin a search, shares of the numbers that it changes, and their correlation."""
+
+ABOVE = 1.1
+"""Error by its reference above which a penalty begins."""
+
+FLOOR = 3.0
+"""Weight of the logarithm by which the worst error exceeds its reference."""
+
+FRICTION = "damping,frictionloss"
+"""What is unknown beside the requested parameters unless told otherwise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A motion that was designed.
+
+    Attributes
+    ----------
+    name : str
+    family : Family
+    numbers : (size,)
+        What :meth:`Family.motion` makes it of.
+    reach : float
+        Share of its amplitude, for torques and collisions.
+    score : float
+        Mean logarithm of the relative errors, by D_s, and the penalty: lower is better.
+    errors : (p,)
+        Standard errors of the requested parameters, relative.
+    share : float
+        Share of the attainable information about them, for each of them.
+    free : bool
+        Whether it keeps the limits of torque and no bodies touch.
+    """
+
+    name: str
+    family: Family
+    numbers: Array
+    reach: float
+    score: float
+    errors: Array
+    share: float
+    free: bool
+
+    def motion(self, dt: float) -> Motion:
+        """Return the motion with rows dt apart [s]."""
+        return self.family.motion(self.numbers, dt, self.reach)
+
+
+class Problem:
+    """What a trajectory is to identify, and under which limits.
+
+    Parameters
+    ----------
+    body : Body
+    limits : Limits
+    wanted : str or sequence of str
+        The requested parameters (:class:`dopt.robots.parameters.Unknowns`).
+    seconds : float
+        Duration of the motion [s].
+    nuisance : str
+        What is also unknown; friction of the joints unless told otherwise.
+    noise : float
+        Standard deviation of a measured torque, as a share of the limit.
+    rate : float
+        Independent measurements of the torques in a second [Hz].
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        limits: Limits,
+        wanted: str | Sequence[str],
+        seconds: float,
+        *,
+        nuisance: str = FRICTION,
+        noise: float = 0.01,
+        rate: float = 500.0,
+    ) -> None:
+        for what, number in (("seconds", seconds), ("noise", noise), ("rate", rate)):
+            if not number > 0 or not math.isfinite(number):
+                raise SpecificationError(
+                    f"{what} of a design is {number!r}, but a positive number is expected: "
+                    f"correct it."
+                )
+        self.body, self.limits, self.seconds, self.rate = body, limits, seconds, rate
+        asked = Unknowns(body, limits, wanted, noise)
+        beside = [one for one in nuisance.split(",") if one]
+        self.unknowns = Unknowns(body, limits, [*asked.names, *beside], noise)
+        self.count = len(asked)
+        self._friction = _friction(body, limits)
+        self.reference = np.ones(self.count)
+
+    @property
+    def requested(self) -> tuple[Parameter, ...]:
+        """The requested parameters, which come first of the unknown ones."""
+        return self.unknowns.parameters[: self.count]
+
+    def information(self, motion: Motion) -> Array:
+        return self.unknowns.information(motion, self.rate)
+
+    def determinant(self, information: Array) -> float:
+        """Return log det of the information about the requested parameters, with the prior."""
+        whole_ = information + np.eye(len(information))
+        rest = whole_[self.count :, self.count :]
+        return float(np.linalg.slogdet(whole_)[1] - np.linalg.slogdet(rest)[1])
+
+    def errors(self, information: Array) -> Array:
+        """Return the relative standard errors of the requested parameters, (p,)."""
+        return relative_errors(information)[: self.count]
+
+    def score(self, information: Array) -> float:
+        """Return the criterion: lower is better."""
+        worst = math.log(float(np.max(self.errors(information) / self.reference)) / ABOVE)
+        return -0.5 * self.determinant(information) / self.count + FLOOR * max(worst, 0.0)
+
+    def strain(self, motion: Motion, rigid: Array | None = None) -> float:
+        """Return the largest share of the limits of torque, friction included."""
+        friction = self._friction * np.tanh(motion.velocities / (0.01 * self.limits.velocity))
+        torques = self.body.torques(motion, rigid) + friction
+        return float(np.abs(torques / self.limits.torque).max())
+
+    def candidate(self, family: Family, numbers: Array) -> Candidate:
+        """Return a motion with its score; its share is not known yet.
+
+        It reaches as far as the torques allow, and has a penalty where bodies touch.
+        """
+        reach = 1.0
+        for _ in range(6):
+            motion = family.motion(numbers, COARSE, reach)
+            rigid = self.body.regressor(motion)
+            strain = self.strain(motion, rigid)
+            if strain <= 1.0:
+                break
+            reach *= max(0.6, 0.98 / math.sqrt(strain))
+        looked = motion.positions[:: round(0.2 / COARSE)]
+        touching = {row for row, _, _ in self.body.collisions(looked)}
+        broken = max(strain - 1.0, 0.0)
+        broken += 0.5 + len(touching) / len(looked) if touching else 0.0
+        information = self.unknowns.information(motion, self.rate, rigid)
+        score, errors = self.score(information) + 10.0 * broken, self.errors(information)
+        return Candidate(family.name, family, numbers, reach, score, errors, 0.0, broken == 0.0)
+
+
+def _friction(body: Body, limits: Limits) -> Array:
+    """Return the friction of each joint at its limit of velocity, or a typical one, (n,)."""
+    model = body.model
+    own = model.dof_frictionloss[body.dofs] + model.dof_damping[body.dofs] * limits.velocity
+    result: Array = np.where(own > 0.0, own, 0.1 * limits.torque)
+    return result
+
+
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """The candidates of a problem, best first.
+
+    Attributes
+    ----------
+    problem : Problem
+    candidates : tuple of Candidate
+    reference : (p,)
+        Median relative errors of random multisines.
+    gap : float
+        Share of the attainable information by which its bound may be too low.
+    """
+
+    problem: Problem
+    candidates: tuple[Candidate, ...]
+    reference: Array
+    gap: float
+
+    @property
+    def best(self) -> Candidate:
+        return self.candidates[0]
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """Expected half-widths of 95 % intervals of the best: in the parameter's unit, relative."""
+        return {
+            one.name: (1.96 * error * one.scale, 1.96 * float(error))
+            for one, error in zip(self.problem.requested, self.best.errors, strict=True)
+        }
+
+    def check(self) -> Identifiability:
+        """Return what the best motion cannot tell."""
+        motion = self.best.motion(COARSE)
+        return Identifiability.of(self.problem.unknowns, motion, self.problem.rate)
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        *,
+        seed: int = 0,
+        effort: int = 600,
+        progress: Callable[[str], object] = lambda _: None,
+    ) -> Self:
+        """Design motions of each family, and compare them.
+
+        Parameters
+        ----------
+        problem : Problem
+        seed : int
+            Seed of the draws.
+        effort : int
+            Motions that are tried for each searched family.
+        progress : callable, optional
+            Is given a line for each family.
+        """
+        seed = whole("seed", seed, 0, 2**63)
+        effort = whole("effort", effort, BEGUN, 10**7)
+        rng = np.random.default_rng(seed)
+        found = list(_candidates(problem, rng, effort, progress))
+        bound, gap = attainable(problem, rng)
+        identified = problem.count - len(_null(problem, found[0]))
+        shared = [
+            dataclasses.replace(one, share=_share(problem, one, bound, identified)) for one in found
+        ]
+        shared.sort(key=lambda one: (not one.free, one.score))
+        if not shared[0].free:
+            raise SpecificationError(
+                "no motion was found within the limits of torque and without collisions: give "
+                "smaller ranges of position around a pose in which the robot is free, or larger "
+                "torques."
+            )
+        return cls(problem, tuple(shared), problem.reference, gap / max(identified, 1))
+
+
+def _is_free(problem: Problem, one: Candidate) -> bool:
+    """Return True if a motion keeps the torques and no bodies touch, by finer steps."""
+    motion = one.motion(FINE)
+    return problem.strain(motion) <= 1.0 and not problem.body.collisions(motion.positions)
+
+
+def _null(problem: Problem, one: Candidate) -> list[str]:
+    return Identifiability.of(problem.unknowns, one.motion(COARSE), problem.rate).null
+
+
+def _share(problem: Problem, one: Candidate, bound: float, identified: int) -> float:
+    reached = problem.determinant(problem.information(one.motion(COARSE)))
+    return math.exp((reached - bound) / max(identified, 1))
+
+
+def _candidates(
+    problem: Problem, rng: np.random.Generator, effort: int, progress: Callable[[str], object]
+) -> Iterator[Candidate]:
+    """Yield the best motion of each family."""
+    limits, seconds = problem.limits, problem.seconds
+    best = multisine(problem, rng)
+    progress(f"multisine, best of {REFERENCES}: {_said(best)}")
+    yield best
+    periods = [period for period in PERIODS if period < seconds] or [seconds]
+    tried = [
+        [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(BEGUN)]
+        for family in (Fourier(limits, seconds, period) for period in [*periods, seconds])
+    ]
+    tried.sort(key=lambda group: min(one.score for one in group))
+    for group in tried[:2]:
+        yield searched(problem, group[0].family, rng, effort, group, progress)
+    ladder = Ladder(limits, seconds)
+    yield searched(problem, ladder, rng, effort, [], progress)
+    yield receding(problem, ladder, rng, progress)
+
+
+def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
+    """Return the best of some random multisines, whose median errors become the reference."""
+    family = Multisine(problem.limits, problem.seconds)
+    problem.reference = np.ones(problem.count)
+    drawn = [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(REFERENCES)]
+    problem.reference = np.median([one.errors for one in drawn], axis=0)
+    return min((problem.candidate(family, one.numbers) for one in drawn), key=lambda one: one.score)
+
+
+def _said(one: Candidate) -> str:
+    return f"mean relative error {100.0 * math.exp(np.log(one.errors).mean()):.3g} %"
+
+
+def searched(
+    problem: Problem,
+    family: Family,
+    rng: np.random.Generator,
+    effort: int,
+    begun: Sequence[Candidate] = (),
+    progress: Callable[[str], object] = lambda _: None,
+) -> Candidate:
+    """Return the best motion that a random search finds.
+
+    From the best of some draws it goes on by changes of a few numbers, and keeps what is better.
+    """
+    drawn = (problem.candidate(family, rng.standard_normal(family.size)) for _ in range(BEGUN))
+    best = min(begun or drawn, key=lambda one: one.score)
+    for _ in range(effort - BEGUN):
+        numbers = best.numbers.reshape(-1, family.n)
+        changed = rng.random(numbers.shape) < rng.choice(CHANGED)
+        fresh = KEPT * numbers + math.sqrt(1.0 - KEPT**2) * rng.standard_normal(numbers.shape)
+        one = problem.candidate(family, np.where(changed, fresh, numbers).ravel())
+        best = min(best, one, key=lambda each: each.score)
+    progress(f"{family.name}, {effort} motions: {_said(best)}")
+    return best
+
+
+def receding(
+    problem: Problem,
+    ladder: Ladder,
+    rng: np.random.Generator,
+    progress: Callable[[str], object] = lambda _: None,
+    tries: int = 12,
+) -> Candidate:
+    """Return a ladder whose segments are chosen one after another, each the best of some draws."""
+    numbers = rng.standard_normal((ladder.segments + 1, ladder.n))
+    best = problem.candidate(ladder, numbers.ravel())
+    for segment in range(1, ladder.segments + 1):
+        for _ in range(tries):
+            numbers = best.numbers.reshape(ladder.segments + 1, ladder.n).copy()
+            numbers[segment] = rng.standard_normal(ladder.n)
+            one = problem.candidate(ladder, numbers.ravel())
+            best = min(best, one, key=lambda each: each.score)
+    progress(f"receding plans, {ladder.segments} segments: {_said(best)}")
+    return dataclasses.replace(best, name="receding plans")
+
+
+POOL, ROUNDS = 1500, 60
+"""States of the measure that bounds the information, and rounds of its improvement."""
+
+
+def attainable(problem: Problem, rng: np.random.Generator) -> tuple[float, float]:
+    """Return a bound of log det of the information about the requested parameters, and its gap.
+
+    The measure over states within the limits is improved by the multiplicative algorithm; then the
+    theorem bounds what any other measure over the same states could add. The states are drawn, half
+    of their velocities and accelerations at the limits.
+
+    Returns
+    -------
+    bound, gap : float
+        The bound holds the gap.
+    """
+    states = _states(problem, rng)
+    rows = problem.unknowns.weighted(states, problem.rate * problem.seconds / states.dt)
+    p, s = len(problem.unknowns), problem.count
+    weights = np.full(len(rows), 1.0 / len(rows))
+    flat = rows.reshape(-1, p)
+    for _ in range(ROUNDS):
+        information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
+        slopes = _slopes(information + np.eye(p), rows, s)
+        mean = float(weights @ slopes)
+        weights = weights * np.sqrt(np.maximum(slopes, 0.0) / mean)
+        weights /= weights.sum()
+    information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
+    slopes = _slopes(information + np.eye(p), rows, s)
+    gap = float(slopes.max() - weights @ slopes)
+    return problem.determinant(information) + gap, gap
+
+
+def _slopes(information: Array, rows: Array, s: int) -> Array:
+    """Return the derivative of D_s by the weight of each state, (N,)."""
+    inverse = np.linalg.inv(information)
+    inverse[s:, s:] -= np.linalg.inv(information[s:, s:])
+    result: Array = np.einsum("tjp,tjp->t", rows @ inverse, rows)
+    return result
+
+
+def _states(problem: Problem, rng: np.random.Generator) -> Motion:
+    """Return states within the limits, also of torque, as the rows of a motion."""
+    limits, n = problem.limits, problem.body.n
+    half = np.diff(limits.position, axis=1)[:, 0] / 2.0
+    q = limits.middle + half * rng.uniform(-1.0, 1.0, (2 * POOL, n))
+    v, a = (
+        np.where(
+            rng.random((2 * POOL, n)) < 0.5,
+            rng.choice([-1.0, 1.0], (2 * POOL, n)),
+            np.sign(rng.standard_normal((2 * POOL, n))) * rng.random((2 * POOL, n)) ** 3,
+        )
+        * limit
+        for limit in (limits.velocity, limits.acceleration)
+    )
+    torques = np.abs(problem.body.torques(Motion(1.0, q, v, a)) / limits.torque).max(axis=1)
+    a /= np.maximum(1.0, torques**2)[:, None]  # towards the torques of rest
+    strains = np.abs(problem.body.torques(Motion(1.0, q, v, a)) / limits.torque).max(axis=1)
+    kept = np.flatnonzero(strains <= 1.0)[:POOL]
+    return Motion(1.0, q[kept], v[kept], a[kept])
+
+
+__all__ = ["Candidate", "Design", "Problem", "attainable", "multisine", "receding", "searched"]

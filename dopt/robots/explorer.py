@@ -1,0 +1,490 @@
+"""Exploration of a robot whose body is known: it moves, learns friction, and stops when told."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time as clock
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+from scipy.stats import chi2
+
+from dopt import arguments
+from dopt.errors import ExplorationError, SpecificationError, unknown_name
+from dopt.robots.body import Body, Motion
+from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
+from dopt.robots.limits import Limits
+from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.windows import window_size
+from dopt.types import Array
+
+LEVELS = np.array([0.022, 0.035, 0.06, 0.12, 0.25, 0.5, 0.93])
+"""Speeds of segments, as parts of the velocity limit."""
+
+HOLDS = np.array([1.5, 4.0, 10.0, 25.0])
+"""Windows for which a segment keeps its speed, at most."""
+
+USED = 0.9
+"""Part of the acceleration limit that references take: the rest is for tracking."""
+
+EDGE = 0.02
+"""Part of a joint's range at each end where references do not go."""
+
+GUARDED = 0.9
+"""Part of the velocity limit from which torques brake."""
+
+FALSE_ALARM = 1e-8
+"""Probability that an unchanged robot looks changed in a window."""
+
+RECENT = 10
+"""Windows whose innovations are compared with their intervals, and, from the 30th, are enough."""
+
+LIFTED = 2.0
+"""Seconds from which a payload is estimated, at least 20 windows."""
+
+LOST = 50
+"""Measurements in turn that make no sense, after which the next is believed."""
+
+INPUTS = ("references", "torques")
+
+_log = logging.getLogger("dopt.robots")
+
+
+class RobotExplorer:
+    """Robot that chooses what it moves next by what that teaches of its friction.
+
+    Ask for torques and tell what was measured, once a period of control:
+
+        explorer = RobotExplorer("arm.xml", limits, stop={"curve": 0.05})
+        while not explorer.done:
+            torque = explorer.ask(q)
+            q = measured_after(torque)
+            explorer.tell(q, torque)
+
+    With ``inputs="references"``, each joint moves with constant speeds and bounded accelerations,
+    tracked by computed torque with the friction learned so far. The next speed of a joint is the
+    one that narrows the widest intervals of its friction curve most a second; ripple is a
+    nuisance.
+    With ``inputs="torques"``, the torques of each period are the paper's D-optimal step.
+
+    Parameters
+    ----------
+    body : Body or path of an MJCF or URDF file
+    limits : Limits
+    friction : str
+        "coulomb_viscous", or "network" with 22 parameters a joint.
+    inputs : str
+        "references" or "torques".
+    dt : float
+        Period of control [s].
+    stop : mapping of str to float
+        Half-widths of intervals, relative to the curve's root mean square, at which to stop, of the
+        ``curve``, ``coulomb`` and ``viscous``. Without any, the robot explores for ever.
+    deadline : float, optional
+        Seconds that :meth:`ask` may plan; a joint whose plan is not ready brakes meanwhile.
+    gamma : float
+        Radius of the ball ‖u/limit‖ ≤ γ of torques.
+    seed : int
+
+    Raises
+    ------
+    SpecificationError
+        If an argument has another form or value.
+    """
+
+    def __init__(
+        self,
+        body: Body | str | Path,
+        limits: Limits,
+        *,
+        friction: str = "coulomb_viscous",
+        inputs: str = "references",
+        dt: float = 0.002,
+        stop: Mapping[str, float] | None = None,
+        deadline: float | None = None,
+        gamma: float = 0.3,
+        seed: int = 0,
+    ) -> None:
+        self.body = body if isinstance(body, Body) else Body.load(body)
+        arguments.instance("limits", limits, Limits, "Limits of the joints")
+        if len(limits.torque) != self.body.n:
+            raise SpecificationError(
+                f"limits of {len(limits.torque)} joints were given, but the robot drives "
+                f"{self.body.n}: give the limits of {', '.join(self.body.joints)}."
+            )
+        if inputs not in INPUTS:
+            raise unknown_name("inputs", inputs, INPUTS)
+        self.limits, self.inputs = limits, inputs
+        self.stop = {
+            name: arguments.within(f"stop.{name}", h, 1.0) for name, h in (stop or {}).items()
+        }
+        for name in self.stop:
+            if name not in ("curve", "coulomb", "viscous"):
+                raise unknown_name("what stops", name, ("curve", "coulomb", "viscous"))
+        self.dt = arguments.within("dt", dt, 0.1)
+        self._deadline = (
+            math.inf if deadline is None else arguments.within("deadline", deadline, math.inf)
+        )
+        self._gamma = arguments.within("gamma", gamma, math.inf)
+        self.known = KnownBody(self.body)
+        possible, inertia = possible_acceleration(self.known, limits)
+        self.acceleration = USED * possible
+        self.learner = FrictionLearner(
+            limits,
+            self.known.inverse,
+            friction,
+            self.dt,
+            relative=min(self.stop.values(), default=0.05),
+            seed=seed,
+            window=window_size(inertia, limits, self.dt),
+        )
+        self._tracker = Tracker(self.known, limits, self.learner.feedforward, self.dt)
+        edge = EDGE * np.ptp(limits.position, axis=1)
+        self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
+        n = self.body.n
+        self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
+        self.counts = {"bad": 0, "late": 0, "plans": 0, "windows": 0, "changed": 0}
+        self.warnings: list[str] = []
+        self.steps, self._wrong, self._asked = 0, 0, False
+        self._rows: list[tuple[Array, ...]] = []
+        self._recent: deque[Array] = deque(maxlen=RECENT)
+        self._payload: list[tuple[Any, ...]] | None = None
+        self._done = False
+        self._due: float | None = None
+        self._alarm = float(chi2.isf(FALSE_ALARM, n))
+
+    @property
+    def done(self) -> bool:
+        """Whether all intervals asked for are as narrow as asked for."""
+        return self._done
+
+    def ask(self, q: npt.ArrayLike, time: float | None = None) -> Array:
+        """Return the torques [N m], (n,), of the next period, at measured positions, (n,).
+
+        Positions that are not finite, or farther away than the joint can have moved, are replaced
+        by those expected; the robot brakes meanwhile.
+
+        Parameters
+        ----------
+        time : float, optional
+            When they were measured [s]; a gap ends the window of samples.
+        """
+        began = clock.perf_counter()
+        measured = arguments.numbers("q", q, self.body.n)
+        if self.steps == 0 and not self._asked:
+            self._begin(measured)
+        self._check_time(time)
+        trusted = self._observe(measured)
+        if self.inputs == "torques" and trusted and not self._done:
+            torque = self._torques()
+        else:
+            self._advance(trusted, began + self._deadline)
+            torque = self._tracker.torque(self._q, self._v, self._a)
+        self._asked, self._torque = True, torque
+        return torque
+
+    def tell(
+        self, q_next: npt.ArrayLike, applied: npt.ArrayLike | None = None, time: float | None = None
+    ) -> None:
+        """Learn from a period: the positions after it, (n,), and the torques applied in it, (n,).
+
+        Without ``applied``, the torques asked for were applied.
+
+        Raises
+        ------
+        ExplorationError
+            If no torques were asked for.
+        """
+        if not self._asked:
+            raise ExplorationError("tell was called before ask, but each follows one: ask first.")
+        after = arguments.numbers("q_next", q_next, self.body.n)
+        torque = (
+            self._torque if applied is None else arguments.numbers("applied", applied, self.body.n)
+        )
+        self._asked = False
+        self._due = None if self._due is None else self._due + self.dt
+        self._check_time(time)
+        self.steps += 1
+        if self._wrong or not np.isfinite(torque).all():
+            self._rows.clear()
+            return
+        self._rows.append((self._measured, torque, self._v))
+        if len(self._rows) == self.learner.window.size:
+            if self._sensible(after, self._tracker.q + self.dt * self._tracker.v):
+                self._learn(after)
+            self._rows.clear()
+
+    def _begin(self, measured: Array) -> None:
+        if not np.isfinite(measured).all():
+            raise ExplorationError(
+                f"the first positions are {measured.tolist()}, but finite ones are expected: begin "
+                f"when the encoders are ready."
+            )
+        self._tracker.place(measured)
+        self._q = measured.copy()
+
+    def _check_time(self, time: float | None) -> None:
+        """End the window of samples where the time is not the one that is expected."""
+        now = arguments.seconds(time)
+        if now is not None and abs(now - (now if self._due is None else self._due)) > 0.5 * self.dt:
+            self.counts["late"] += 1
+            self._rows.clear()
+        self._due = self._due if now is None else now
+
+    def _sensible(self, measured: Array, expected: Array) -> bool:
+        room = 4.0 * self.dt * self.limits.velocity + 0.001 * np.ptp(self.limits.position, axis=1)
+        return bool((np.abs(measured - expected) <= room).all())  # false for NaN
+
+    def _observe(self, measured: Array) -> bool:
+        """Correct the observed state; return False while measurements make no sense."""
+        tracker = self._tracker
+        if self.steps:
+            tracker.predict(self._a)
+        if self._sensible(measured, tracker.q):
+            self._wrong = 0
+            tracker.correct(measured)
+            self._measured = measured
+            return True
+        self.counts["bad"] += 1
+        self._wrong += 1
+        if self._wrong > LOST and np.isfinite(measured).all():
+            tracker.place(measured)
+            self._q, self._v = measured.copy(), np.zeros(self.body.n)
+        return False
+
+    # References: each joint keeps a speed for a while.
+
+    def _advance(self, trusted: bool, until: float) -> None:
+        """Move the references by a period, with new segments where one has ended."""
+        if trusted and not self._done:
+            for j in np.flatnonzero(self._hold <= 0.0):
+                if clock.perf_counter() > until:
+                    self.counts["late"] += 1
+                    self._target[j] = 0.0
+                else:
+                    self._target[j], self._hold[j] = self._segment(int(j))
+                    self.counts["plans"] += 1
+        else:
+            self._target[:], self._hold[:] = 0.0, 0.0
+        most = self.acceleration
+        a = np.clip((self._target - self._v) / self.dt, -most, most)
+        v = self._v + a * self.dt
+        rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
+        blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
+        a = np.where(blocked, np.clip(-self._v / self.dt, -most, most), a)
+        self._a, self._v = a, self._v + a * self.dt
+        self._q = self._q + self.dt * self._v
+        reached = np.abs(self._v - self._target) < 1e-9
+        self._hold = np.where(blocked, 0.0, self._hold - self.dt * reached)
+
+    def _segment(self, j: int) -> tuple[float, float]:
+        """Return the speed and the time for which joint j keeps it with the largest gain a second.
+
+        A segment is one equation: the mean of its features, with the noise of its windows.
+        """
+        learner, most, p = self.learner, self.acceleration[j], self.learner.p
+        speeds = np.repeat(np.concatenate([LEVELS, -LEVELS]), len(HOLDS))
+        u = speeds * self.limits.velocity[j]
+        hold = np.tile(HOLDS * learner.window.seconds, 2 * len(LEVELS))
+        least = hold[0]
+        rising = np.abs(u - self._v[j]) / most
+        start = self._q[j] + 0.5 * (u + self._v[j]) * rising
+        end = np.where(u > 0.0, self._high[j], self._low[j])
+        room = (end - start - u * np.abs(u) / (2.0 * most)) / u
+        hold = np.minimum(hold, room)
+        fits = hold >= least
+        if not fits.any():
+            return 0.0, 0.0
+        speeds, start, hold, rising = speeds[fits], start[fits], hold[fits], rising[fits]
+        rows = learner.model.jacobian(
+            np.broadcast_to(learner.mean[j : j + 1, :p], (1, p)), speeds[None]
+        )[0]
+        features = _mean_features(start, start + u[fits] * hold)
+        X = np.concatenate([rows, features], axis=1)
+        covariance = learner.covariance[j]
+        spread = X @ covariance
+        variance = 1.0 / np.maximum(hold / learner.window.seconds - 0.5, 0.5) + (X * spread).sum(
+            axis=1
+        )
+        # Variances of the curve, and what the segment takes from them; the widest count most.
+        curve = learner.rows(SPEEDS)[j, :-2]
+        before = ((curve @ covariance[:p, :p]) * curve).sum(axis=1)
+        taken = (spread[:, :p] @ curve.T) ** 2 / variance[:, None]
+        shares = taken @ before**3 / (before**4).sum()
+        gains = -np.log1p(-np.minimum(shares, 1.0 - 1e-12)) / (rising + hold)
+        best = int(gains.argmax())
+        return float(u[fits][best]), float(hold[best])
+
+    # Torques: the paper's step.
+
+    def _torques(self) -> Array:
+        """Return torques on the ball that maximise the linearised gain, or brake.
+
+        The state moves q̇ first: with δ = dt M⁻¹ u the gain Σ_j (J_j + δ_j ∂J_j)ᵀ P_j (·) is
+        quadratic, with Q = dt² M⁻ᵀ diag(∂JᵀP∂J) M⁻¹ and v = -dt M⁻ᵀ (JᵀP∂J).
+        """
+        learner, tracker, limits = self.learner, self._tracker, self.limits
+        n, p = self.body.n, learner.p
+        bias = self.known.inverse(tracker.q, tracker.v, np.zeros(n))
+        mass = self.known.mass_matrix()
+        inverse = np.linalg.inv(mass)
+        friction = learner.torques(tracker.v)
+        idle = inverse @ (-bias - friction)
+        x = ((tracker.v + self.dt * idle) / limits.velocity)[:, None]
+        parameters = learner.mean[:, :p]
+        J = learner.model.jacobian(parameters, x)[:, 0]
+        bent = learner.model.slopes(parameters, x)[1][:, 0] / limits.velocity[:, None]
+        weighed = (learner.covariance[:, :p, :p] @ bent[..., None])[..., 0]
+        D = self.dt * inverse * limits.torque
+        Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)
+        v = -D.T @ (J * weighed).sum(axis=1)
+        chosen = _on_sphere(Q, v, self._gamma)
+        a = idle + inverse @ (chosen * limits.torque)
+        after = tracker.v + self.dt * a
+        rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
+        outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
+        guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
+        if guarded.any():
+            brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
+            a = np.where(guarded, brake, a)
+        self._a = a
+        demand = mass @ self._a + bias + friction
+        self._q, self._v = tracker.q.copy(), tracker.v.copy()
+        torque: Array = np.minimum(np.maximum(demand, -limits.torque), limits.torque)
+        return torque
+
+    # What a window teaches.
+
+    def _learn(self, after: Array) -> None:
+        positions = np.array([*(row[0] for row in self._rows), after])
+        torques = np.array([*(row[1] for row in self._rows), np.zeros(self.body.n)])
+        rates = np.array([row[2] for row in self._rows]) if self.inputs == "references" else None
+        means = self.learner.window.means(positions, torques)
+        self.counts["windows"] += 1
+        if self._payload is not None:
+            self._payload.append((means, rates))
+            if len(self._payload) >= max(2 * RECENT, LIFTED / self.learner.window.seconds):
+                self._lift(self._payload)
+            return
+        before = self.learner.feedforward(self._v)
+        self._recent.append(self.learner.learn(means, rates) / np.sqrt(self.learner.inflation))
+        self._q = self._q - self._tracker.lag(self.learner.feedforward(self._v) - before)
+        if self._changed():
+            self.counts["changed"] += 1
+            self._say(
+                f"after {self.steps * self.dt:.2f} s the torques no longer fit the body and the "
+                f"friction learned: a payload is estimated, and friction learned again"
+            )
+            self._payload = []
+            self._done = False
+        elif self.stop and self.counts["windows"] % 5 == 0:
+            self._done = self._reached()
+
+    def _changed(self) -> bool:
+        """Compare the means of recent innovations with a χ² of one degree a joint.
+
+        Torques turn joints round within windows, which then fit badly: they are not compared.
+        """
+        few = len(self._recent) < RECENT or self.counts["windows"] < 3 * RECENT
+        if few or self.inputs == "torques":
+            return False
+        recent = np.array(self._recent)
+        known = np.isfinite(recent)
+        sums = np.where(known, recent, 0.0).sum(axis=0) ** 2 / np.maximum(known.sum(axis=0), 1)
+        return bool(sums.sum() > self._alarm)
+
+    def _lift(self, windows: list[tuple[Any, ...]]) -> None:
+        """Estimate mass and centre of what the last body carries, and add them to it.
+
+        Columns of the regressor, less friction and ripple as they are known, weighed by the noise.
+        """
+        learner = self.learner
+        q, v, a = (np.array([means[i] for means, _ in windows]) for i in range(3))
+        own = self.body.regressor(Motion(learner.window.seconds, q, v, a))[:, :, -10:-6]
+        missing = np.array([learner.innovations(*window)[0] for window in windows])
+        moving = np.isfinite(missing)
+        weights = moving / learner.noise
+        design = own / self.limits.torque[:, None] * weights[..., None]
+        found, *_ = np.linalg.lstsq(
+            design.reshape(-1, 4), (np.nan_to_num(missing) * weights).reshape(-1), rcond=1e-6
+        )
+        mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
+        self.known.hang(mass, found[1:])
+        learner.forget(10.0)
+        self._say(f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3)} kg m")
+        self._recent.clear()
+        self._payload = None
+
+    def _say(self, text: str) -> None:
+        self.warnings.append(text)
+        _log.warning(text)
+
+    def _reached(self) -> bool:
+        half, sizes = self.learner.intervals()[1], self.learner.sizes()
+        widths = {"curve": half[:, :-2].max(axis=1), "coulomb": half[:, -2], "viscous": half[:, -1]}
+        return all(bool((widths[name] <= h * sizes).all()) for name, h in self.stop.items())
+
+    def curve(self, joint: int, velocities: npt.ArrayLike) -> tuple[Array, Array, Array]:
+        """Return friction [N m] of a joint and the ends of its intervals, at velocities (k,)."""
+        x = arguments.reals("velocities", velocities)
+        return self.learner.curve(joint, x)
+
+    def report(self) -> dict[str, Any]:
+        """Return what is known: constants with half-widths [N m; N m s], widths, counts, warnings.
+
+        Heights of Stribeck friction are biased: it is fastest where joints turn round.
+        """
+        learner, unit, velocity = self.learner, self.limits.torque, self.limits.velocity
+        values, half = (part * unit[:, None] for part in learner.intervals())
+        joints = {
+            name: {
+                "coulomb": (values[j, -2], half[j, -2]),
+                "viscous": (values[j, -1] / velocity[j], half[j, -1] / velocity[j]),
+                "relative_width": half[j, :-2].max() / (learner.sizes()[j] * unit[j]),
+                "noise": learner.noise[j] * unit[j],
+            }
+            for j, name in enumerate(self.body.joints)
+        }
+        if isinstance(learner.model, CoulombViscous):
+            for j, name in enumerate(self.body.joints):
+                joints[name]["stribeck_biased"] = learner.mean[j, 2 : learner.p] * unit[j]
+        done = {"seconds": self.steps * self.dt, "done": self._done, "joints": joints}
+        return done | {"counts": dict(self.counts), "warnings": list(self.warnings)}
+
+
+def _on_sphere(Q: Array, v: Array, radius: float) -> Array:
+    """Return the maximiser of uᵀQu - 2vᵀu on ‖u‖ = radius, faster than :mod:`dopt.sphere` in numpy.
+
+    The eigenvalues of Q and the root of the secular equation; a linear term along the top
+    eigenvector is never quite 0, which leaves the hard case out.
+    """
+    values, axes = np.linalg.eigh(Q)
+    w, gaps = axes.T @ v, values[-1] - values
+    size = max(float(np.linalg.norm(w)), float(gaps[0]) * radius, 1e-300)
+    w, gaps = w / size, gaps / size
+    w[-1] = w[-1] if abs(w[-1]) > 1e-9 else 1e-9
+    low, high = abs(w[-1]) / radius, float(np.linalg.norm(w)) / radius
+    tau = low
+    if high > low * (1.0 + 1e-12):
+        pairs = list(zip(w.tolist(), gaps.tolist(), strict=True))
+        tau = brentq(lambda t: sum((x / (d + t)) ** 2 for x, d in pairs) - radius**2, low, high)
+    u = axes @ (-w / (gaps + tau))
+    result: Array = u * (radius / np.linalg.norm(u))
+    return result
+
+
+def _mean_features(start: Array, end: Array) -> Array:
+    """Return the means of the features of ripple between positions, each (k,), (k, 62)."""
+    a, b = start[:, None] * RIPPLE, end[:, None] * RIPPLE
+    cosines, sines = np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)
+    result: Array = np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2)
+    return result
+
+
+__all__ = ["INPUTS", "RobotExplorer"]

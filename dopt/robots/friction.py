@@ -1,0 +1,367 @@
+"""Friction of a robot's joints, learned from what its known body does not explain.
+
+What is learned is the missing torque τ - ID(q, q̇, q̈) of each joint as a function of its own rate:
+the information is one block a joint. Torques are learned as parts x of the torque limit, rates as
+parts of the velocity limit. Torque that depends on the position (ripple) is a nuisance: a random
+function with 10 to 40 periods a turn, whose coefficients are learned and told apart from friction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from dopt.errors import unknown_name
+from dopt.robots.limits import Limits
+from dopt.robots.windows import WINDOW, Window, boundary, half_widths
+from dopt.types import Array
+
+SLOW = 0.01
+"""Windows in which a joint is slower than this part of its limit teach nothing of its friction."""
+
+SPEEDS = np.geomspace(0.02, 0.95, 12)
+"""Parts of the velocity limit at which the friction curve is judged."""
+
+RIPPLE = np.arange(10.0, 41.0)
+"""Periods a turn, or in 2π m, of torque that depends on the position."""
+
+RIPPLE_SIZE = 1.5
+"""Standard deviation of the ripple before any sample, in units of a window's noise."""
+
+NOISE = 0.003
+"""Standard deviation of a window's torque before any sample, as a part of the limit."""
+
+NEAR = 1.4
+"""Multiple of the width asked for from which the stop is near."""
+
+BATCH = 10
+"""Windows in a batch, whose means show how far innovations are correlated."""
+
+SIGN = 0.003
+"""Width in which dry friction is taken to change its sign."""
+
+
+class FrictionModel(Protocol):
+    """Friction of n joints with p parameters each; rates and torques as parts of the limits."""
+
+    start: Array
+    """Parameters before any sample, (n, p)."""
+    spread: Array
+    """Their standard deviations, (p,)."""
+
+    def torques(self, parameters: Array, x: Array) -> Array:
+        """Return f at rates (n, k), (n, k)."""
+
+    def jacobian(self, parameters: Array, x: Array) -> Array:
+        """Return J = ∂f/∂θ, (n, k, p)."""
+
+    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
+        """Return ∂f/∂x, (n, k), and ∂J/∂x, (n, k, p)."""
+
+
+class CoulombViscous:
+    """Coulomb and viscous friction, and Stribeck terms of fixed widths: linear in its parameters.
+
+    The parameters are the Coulomb torque, the viscous torque at the velocity limit, and heights.
+    """
+
+    widths = np.array([0.015, 0.03, 0.06])
+    spread = np.array([0.1, 0.1, 0.015, 0.015, 0.015])
+
+    def __init__(self, n: int) -> None:
+        self.start = np.zeros((n, len(self.spread)))
+
+    def torques(self, parameters: Array, x: Array) -> Array:
+        result: Array = np.einsum("nkp,np->nk", self.jacobian(parameters, x), parameters)
+        return result
+
+    def jacobian(self, parameters: Array, x: Array) -> Array:  # noqa: ARG002  # linear in them
+        sign = np.tanh(x / SIGN)
+        heights = sign[..., None] * np.exp(-((x[..., None] / self.widths) ** 2))
+        return np.concatenate([sign[..., None], x[..., None], heights], axis=2)
+
+    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
+        sign = np.tanh(x / SIGN)
+        turned = (1.0 - sign**2) / SIGN
+        bells = np.exp(-((x[..., None] / self.widths) ** 2))
+        falling = bells * -2.0 * x[..., None] / self.widths**2
+        heights = turned[..., None] * bells + sign[..., None] * falling
+        rows = np.concatenate([turned[..., None], np.ones_like(x)[..., None], heights], axis=2)
+        return np.einsum("nkp,np->nk", rows, parameters), rows
+
+
+class Network:
+    """Network of 7 tanh units of the rate: f(x) = d + Σ_k c_k tanh(s_k x + b_k), 22 parameters.
+
+    The parameters are c, ln s, b and d; the scales s begin spread from dry friction to viscous.
+    """
+
+    scales = np.array([100.0, 50.0, 25.0, 12.0, 5.0, 2.0, 0.7])
+    heights = (0.06, 0.015, 0.015, 0.015, 0.03, 0.06, 0.1)
+    spread = np.concatenate([heights, np.full(7, 0.15), np.full(7, 0.05), [0.003]])
+
+    def __init__(self, n: int, seed: int = 0) -> None:
+        random = np.random.default_rng(seed)
+        self.start = np.zeros((n, 22))
+        self.start[:, :7] = random.uniform(0.0005, 0.001, (n, 7))
+        self.start[:, 7:14] = np.log(self.scales)
+
+    def _units(self, parameters: Array, x: Array) -> tuple[Array, Array, Array, Array]:
+        c, s = parameters[:, None, :7], np.exp(parameters[:, None, 7:14])
+        t = np.tanh(s * x[..., None] + parameters[:, None, 14:21])
+        return c, s, t, 1.0 - t**2
+
+    def torques(self, parameters: Array, x: Array) -> Array:
+        c, _, t, _ = self._units(parameters, x)
+        result: Array = (c * t).sum(axis=2) + parameters[:, 21:]
+        return result
+
+    def jacobian(self, parameters: Array, x: Array) -> Array:
+        c, s, t, bent = self._units(parameters, x)
+        one = np.ones((*x.shape, 1))
+        return np.concatenate([t, c * bent * s * x[..., None], c * bent, one], axis=2)
+
+    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
+        c, s, t, bent = self._units(parameters, x)
+        falling = -2.0 * t * bent * s
+        of_scales = c * s * (bent + falling * x[..., None])
+        none = np.zeros((*x.shape, 1))
+        rows = np.concatenate([bent * s, of_scales, c * falling, none], axis=2)
+        return (c * bent * s).sum(axis=2), rows
+
+
+FRICTION: Mapping[str, Callable[[int, int], FrictionModel]] = {
+    "coulomb_viscous": lambda n, _: CoulombViscous(n),
+    "network": Network,
+}
+"""Models of friction, by their names, of n joints and a seed."""
+
+
+class FrictionLearner:
+    """Recursive least squares of friction and ripple, one block a joint, by windows of samples.
+
+    A network is linearised at its present parameters: an extended Kalman filter at rest.
+
+    Parameters
+    ----------
+    limits : Limits
+    inverse : function
+        Torques of the known body, (n,), at position, velocity and acceleration, each (n,).
+    friction : str
+        A key of ``FRICTION``.
+    dt : float
+        Period of control [s].
+    relative : float
+        Half-width of the curve's interval that is asked for, relative to the curve's root mean
+        square: the intervals are narrowest there.
+    seed : int
+        Seed of the network's first parameters.
+    level : float
+        Probability that an interval misses, 0.05.
+    window : int
+        Periods of control in a window.
+    """
+
+    def __init__(
+        self,
+        limits: Limits,
+        inverse: Callable[[Array, Array, Array], Array],
+        friction: str = "coulomb_viscous",
+        dt: float = 0.002,
+        relative: float = 0.05,
+        seed: int = 0,
+        level: float = 0.05,
+        window: int = WINDOW[0],
+    ) -> None:
+        if friction not in FRICTION:
+            raise unknown_name("friction", friction, FRICTION)
+        n = len(limits.torque)
+        self.limits, self.window, self._inverse = limits, Window(dt, window), inverse
+        self.model: FrictionModel = FRICTION[friction](n, seed)
+        self.n, self.p = n, self.model.start.shape[1]
+        spread = self.model.spread / NOISE
+        ripple = np.full(2 * len(RIPPLE), RIPPLE_SIZE / math.sqrt(len(RIPPLE)))
+        self.mean = np.concatenate([self.model.start, np.zeros((n, len(ripple)))], axis=1)
+        self._prior = np.diag(np.concatenate([spread, ripple]) ** 2)
+        self.covariance = np.tile(self._prior, (n, 1, 1))
+        self._squares = np.full((2, n), [[10.0 * NOISE**2], [10.0]])
+        self._batches, self._pending = np.full((2, n), 10.0), np.zeros((2, n))
+        self.boundary, self.relative = boundary(level), relative
+        self._expected: Array | None = None
+        self.windows = np.zeros(n, dtype=int)
+
+    @property
+    def noise(self) -> Array:
+        """Standard deviation of a window's torque, (n,), as a part of the limit."""
+        result: Array = np.sqrt(self._squares[0] / self._squares[1])
+        return result
+
+    @property
+    def inflation(self) -> Array:
+        """Variance of means of innovations relative to uncorrelated ones, (n,), at least 1."""
+        result: Array = np.maximum(1.0, self._batches[0] / self._batches[1])
+        return result
+
+    def torques(self, velocities: Array) -> Array:
+        """Return friction as it was learned [N m], (n,), at velocities (n,)."""
+        x = (velocities / self.limits.velocity)[:, None]
+        result: Array = self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
+        return result
+
+    def feedforward(self, velocities: Array) -> Array:
+        """Return friction to feed forward [N m], (n,), at velocities (n,).
+
+        It is what was learned, less its standard error: too much of it drives a joint too fast.
+        """
+        x = (velocities / self.limits.velocity)[:, None]
+        parameters = self.mean[:, : self.p]
+        value = self.model.torques(parameters, x)[:, 0]
+        rows = self.model.jacobian(parameters, x)
+        variance = (rows @ self.covariance[:, : self.p, : self.p] * rows).sum(axis=(1, 2))
+        size = np.abs(value) - self.noise * np.sqrt(np.maximum(variance, 0.0))
+        result: Array = np.sign(value) * np.maximum(size, 0.0) * self.limits.torque
+        return result
+
+    def features(self, q: Array) -> Array:
+        """Return the features of ripple at positions (..., n), (..., n, 62)."""
+        angles = q[..., None] * RIPPLE
+        return np.concatenate([np.cos(angles), np.sin(angles)], axis=-1)
+
+    def innovations(
+        self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Return e, H and its prior variance in units of noise: (n,), (n, d) and (n,).
+
+        Where a joint is too slow, e is NaN and H zero. Arguments as of :meth:`learn`.
+        """
+        q, v, a, torque = means
+        times, limit = self.window.times[1:-1], self.limits.velocity
+        within = (v + times[:, None] * a) / limit
+        x = within if rates is None else rates[1:] / limit
+        moving = (np.abs(x).min(axis=0) > SLOW) & (np.abs(np.sign(x).sum(axis=0)) == len(x))
+        within = within.T
+        weights = self.window.weights[1:-1]
+        parameters = self.mean[:, : self.p]
+        mean = self.model.torques(parameters, within) @ weights
+        rows = weights @ self.model.jacobian(parameters, within)
+        features = self.features(q)
+        missing = (torque - self._inverse(q, v, a)) / self.limits.torque
+        missing = missing - mean - (features * self.mean[:, self.p :]).sum(axis=1)
+        rows = np.concatenate([rows, features], axis=1) * moving[:, None]
+        variance = (rows * self._spread(rows)).sum(axis=1)
+        return np.where(moving, missing, np.nan), rows, variance
+
+    def _spread(self, rows: Array) -> Array:
+        result: Array = np.squeeze(self.covariance @ rows[..., None], 2)
+        return result
+
+    def learn(self, means: tuple[Array, Array, Array, Array], rates: Array | None = None) -> Array:
+        """Learn from a window; return its standardised innovations, (n,), NaN where it is slow.
+
+        Parameters
+        ----------
+        means : tuple of (n,)
+            As :meth:`Window.means` returns them.
+        rates : (N, n), optional
+            Velocities of the reference, which tell whether a joint is too slow: measured ones are
+            the lower, the larger the noise was, and leave a biased choice of windows.
+        """
+        missing, rows, variance = self.innovations(means, rates)
+        moving = np.isfinite(missing)
+        error = np.where(moving, missing, 0.0)
+        standard = error / np.sqrt(1.0 + variance)
+        result = np.where(moving, standard / self.noise, np.nan)
+        spread = self._spread(rows)
+        self.mean += spread * (error / (1.0 + variance))[:, None]
+        self.covariance -= spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
+        self._squares += np.where(moving, [standard**2, np.ones(self.n)], 0.0)
+        self._pending += np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
+        full = self._pending[1] >= BATCH
+        self._batches += np.where(full, [self._pending[0] ** 2 / BATCH, np.ones(self.n)], 0.0)
+        self._pending[:, full] = 0.0
+        self.windows += moving
+        return result
+
+    def forget(self, factor: float) -> None:
+        """Multiply the errors of friction: the body that it was learned with has changed."""
+        self.covariance[:, : self.p] *= factor
+        self.covariance[:, :, : self.p] *= factor
+        self._expected = None
+
+    def rows(self, speeds: Array) -> Array:
+        """Return the gradients of the curve at speeds, and of the two constants, (n, k + 2, p)."""
+        x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
+        return _with_constants(self.model.jacobian(self.mean[:, : self.p], x))
+
+    def _values(self, speeds: Array) -> Array:
+        x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
+        return _with_constants(self.model.torques(self.mean[:, : self.p], x))
+
+    def deviations(self, speeds: Array = SPEEDS) -> Array:
+        """Return standard errors as parts of the torque limit, (n, k + 2), as :meth:`intervals`."""
+        rows = self.rows(speeds)
+        block = self.covariance[:, : self.p, : self.p]
+        variance = np.einsum("nkp,npq,nkq->nk", rows, block, rows)
+        scale = self.noise * np.sqrt(self.inflation)
+        result: Array = np.sqrt(np.maximum(variance, 0.0)) * scale[:, None]
+        return result
+
+    def intervals(self) -> tuple[Array, Array]:
+        """Return values and half-widths as parts of the torque limit, each (n, 14).
+
+        The columns are the curve at ``SPEEDS``, Coulomb friction, and viscous at full velocity.
+        """
+        values, errors = self._values(SPEEDS), self.deviations()
+        return values, half_widths(errors, self._information(errors), self.boundary)
+
+    def sizes(self) -> Array:
+        """Return the root mean square of each joint's curve, (n,), as a part of the limit."""
+        result: Array = np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
+        return result
+
+    def _information(self, errors: Array) -> Array | None:
+        """Return the information expected at the stop, (n, 14), None until it is near.
+
+        It is fixed once the widest interval of each curve takes half as much information again.
+        """
+        if self._expected is None:
+            widest = self.boundary * errors[:, :-2].max(axis=1)
+            if not (widest < NEAR * self.relative * self.sizes()).all():
+                return None
+            self._expected = 1.25 / errors**2
+        return self._expected
+
+    def curve(self, joint: int, velocities: Array) -> tuple[Array, Array, Array]:
+        """Return friction [N m] and the ends of its intervals, each (k,), at velocities (k,)."""
+        unit, x = self.limits.torque[joint], np.asarray(velocities) / self.limits.velocity[joint]
+        values, errors = self._values(x)[joint, :-2], self.deviations(x)[joint, :-2]
+        expected = self._information(self.deviations())
+        if expected is not None:
+            speeds = np.log(np.clip(np.abs(x), SPEEDS[0], SPEEDS[-1]))
+            known = np.log(expected[joint, :-2])
+            expected = np.exp(np.interp(speeds, np.log(SPEEDS), known))
+        half = half_widths(errors, expected, self.boundary)
+        return values * unit, (values - half) * unit, (values + half) * unit
+
+
+def _with_constants(columns: Array) -> Array:
+    """Replace the last two columns, at half of the velocity limit and at it, by two constants.
+
+    Coulomb and viscous friction are the line through them: Stribeck friction is over there.
+    """
+    half, full = columns[:, -2].copy(), columns[:, -1].copy()
+    columns[:, -2], columns[:, -1] = 2.0 * half - full, 2.0 * (full - half)
+    return columns
+
+
+__all__ = [
+    "FRICTION",
+    "SPEEDS",
+    "CoulombViscous",
+    "FrictionLearner",
+    "FrictionModel",
+    "Network",
+]

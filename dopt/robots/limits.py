@@ -1,0 +1,229 @@
+"""Limits of a robot's joints, from files, with what looks wrong in them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import xml.etree.ElementTree as Xml
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dopt.errors import SpecificationError, given_path, unknown_name
+from dopt.robots.body import Body, Motion
+from dopt.types import Array
+
+KINDS = ("position", "velocity", "acceleration", "torque")
+"""What is limited, in rad or m, per s, per s², and N m or N."""
+
+STOPPING = 0.2
+"""Seconds from the largest velocity to rest: the acceleration where none is given."""
+
+FAST, STRONG = 2.0 * math.pi, 300.0
+"""Velocity [rad/s] and torque [N m] from which equal limits of all joints look like defaults."""
+
+WIDE = 1e3
+"""Limits of this size are none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Limits of n joints.
+
+    Attributes
+    ----------
+    position : (n, 2)
+        Least and largest [rad or m].
+    velocity, acceleration, torque : (n,)
+        Largest magnitudes.
+    notes : tuple of str
+        What was assumed, and what looks like a default.
+    """
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+    torque: Array
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, body: Body, file: str | Path | None = None) -> Limits:
+        """Return the limits in a YAML file, completed by those in the robot's own file.
+
+        The file holds, for each joint or for ``default``, some of ``position: [low, high]``,
+        ``velocity``, ``acceleration`` and ``torque``, all under ``joints``:
+
+            joints:
+              default: {acceleration: 10}
+              joint_1: {position: [-2.9, 2.9], velocity: 1.7, torque: 176}
+
+        Raises
+        ------
+        SpecificationError
+            If the file cannot be read, names another joint, or a limit is missing in both.
+        """
+        own = _own(body)
+        given = {} if file is None else _given(body, Path(file))
+        values: dict[str, list[Any]] = {kind: [] for kind in KINDS}
+        assumed = []
+        for j, name in enumerate(body.joints):
+            for kind in KINDS:
+                value = given.get((name, kind), own[kind][j])
+                if value is None and kind == "acceleration":
+                    value = values["velocity"][-1] / STOPPING
+                    assumed.append(name)
+                if value is None:
+                    raise SpecificationError(
+                        f"joint '{name}' has no limit of its {kind}, but one is expected: give a "
+                        f"file of limits with 'joints: {{{name}: {{{kind}: …}}}}'."
+                    )
+                values[kind].append(value)
+        arrays = {kind: np.array(value, dtype=float) for kind, value in values.items()}
+        notes = [*_suspicious(body, arrays, given)]
+        if assumed:
+            notes.append(
+                f"no acceleration is given for {_listed(assumed)}: the velocity in {STOPPING:g} s "
+                f"is assumed"
+            )
+        return cls(**arrays, notes=tuple(notes))
+
+    @property
+    def middle(self) -> Array:
+        """Middle of the ranges of position, (n,)."""
+        result: Array = self.position.mean(axis=1)
+        return result
+
+    def shares(self, motion: Motion, torques: Array | None = None) -> dict[str, float]:
+        """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
+        half = np.diff(self.position, axis=1)[:, 0] / 2.0
+        taken = {
+            "position": (motion.positions - self.middle) / half,
+            "velocity": motion.velocities / self.velocity,
+            "acceleration": motion.accelerations / self.acceleration,
+        }
+        if torques is not None:
+            taken["torque"] = torques / self.torque
+        return {kind: float(np.abs(share).max()) for kind, share in taken.items()}
+
+
+def _own(body: Body) -> dict[str, list[Any]]:
+    """Return the limits in the robot's own file; None where it has none."""
+    model, ids = body.model, [body.model.joint(name).id for name in body.joints]
+    own: dict[str, list[Any]] = {kind: [None] * body.n for kind in KINDS}
+    for k, j in enumerate(ids):
+        if model.jnt_limited[j]:
+            own["position"][k] = [float(x) for x in model.jnt_range[j]]
+        torque = _torque(body, j)
+        own["torque"][k] = torque if 0.0 < torque < WIDE else None
+    if body.source is not None and body.source.suffix == ".urdf":
+        for joint in Xml.parse(body.source).getroot().iter("joint"):
+            limit, name = joint.find("limit"), joint.get("name")
+            if limit is not None and name in body.joints and "velocity" in limit.keys():  # noqa: SIM118  # an element, no mapping
+                own["velocity"][body.joints.index(name)] = float(limit.get("velocity", 0.0)) or None
+    return own
+
+
+def _torque(body: Body, j: int) -> float:
+    """Return the largest torque of a joint by its own range and its actuators."""
+    model, found = body.model, math.inf
+    if model.jnt_actfrclimited[j]:
+        found = float(np.abs(model.jnt_actfrcrange[j]).min())
+    for a in range(model.nu):
+        if int(model.actuator_trntype[a]) in (0, 1) and int(model.actuator_trnid[a, 0]) == j:
+            gear = abs(float(model.actuator_gear[a, 0]))
+            if model.actuator_forcelimited[a]:
+                found = min(found, gear * float(np.abs(model.actuator_forcerange[a]).min()))
+            elif model.actuator_ctrllimited[a] and not model.actuator_biastype[a]:
+                gain = gear * abs(float(model.actuator_gainprm[a, 0]))
+                found = min(found, gain * float(np.abs(model.actuator_ctrlrange[a]).min()))
+    return found
+
+
+def _given(body: Body, file: Path) -> dict[tuple[str, str], Any]:
+    """Return the limits in a file by joint and kind."""
+    import yaml  # type: ignore[import-untyped]  # it has no types
+
+    source = given_path(str(file), "the file of limits", SpecificationError)
+    try:
+        sections = yaml.safe_load(source.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise SpecificationError(
+            f"{source} cannot be read ({' '.join(str(error).split())}), but limits in YAML are "
+            f"expected: correct it."
+        ) from error
+    sections = sections.get("joints") if isinstance(sections, Mapping) else None
+    if not isinstance(sections, Mapping):
+        raise SpecificationError(
+            f"{source} has no mapping 'joints', but the limits of each joint are expected there, "
+            f"such as 'joints: {{{body.joints[0]}: {{velocity: 2}}}}': correct it."
+        )
+    given = {}
+    for name, section in sorted(sections.items(), key=lambda pair: pair[0] != "default"):
+        if name != "default" and name not in body.joints:
+            raise unknown_name("joint", str(name), body.joints)
+        if not isinstance(section, Mapping):
+            raise _unlike(source, str(name), section, "a mapping of limits")
+        for kind, value in section.items():
+            if kind not in KINDS:
+                raise unknown_name(f"limit of joint '{name}'", str(kind), KINDS)
+            value = _checked(source, f"{name}.{kind}", value, kind == "position")
+            for joint in body.joints if name == "default" else [str(name)]:
+                given[joint, kind] = value
+    return given
+
+
+def _checked(source: Path, what: str, value: Any, is_range: bool) -> Any:
+    """Return a positive number, or a range [low, high]; a number is the range about 0."""
+    if is_range and isinstance(value, int | float) and not isinstance(value, bool):
+        value = [-abs(value), abs(value)]
+    numbers = value if is_range and isinstance(value, list) else [value]
+    fine = all(
+        isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in numbers
+    )
+    if is_range:
+        if not fine or len(numbers) != 2 or numbers[0] >= numbers[1]:
+            raise _unlike(source, what, value, "[low, high]")
+        return [float(x) for x in numbers]
+    if not fine or numbers[0] <= 0:
+        raise _unlike(source, what, value, "a positive number")
+    return float(numbers[0])
+
+
+def _suspicious(
+    body: Body, limits: Mapping[str, Array], given: Mapping[tuple[str, str], Any]
+) -> list[str]:
+    """Return a sentence for each kind of limit that looks like a default of the robot's file."""
+    found = []
+    for kind, size, unit in (("velocity", FAST, "rad/s"), ("torque", STRONG, "N m")):
+        own = [
+            v
+            for v, name in zip(limits[kind], body.joints, strict=True)
+            if (name, kind) not in given
+        ]
+        if len(own) > 2 and len(set(own)) == 1:
+            looks = "looks like a default" if own[0] >= size else "may be a default"
+            found.append(
+                f"every joint has the {kind} {own[0]:g} {unit}, which {looks}: look it up in the "
+                f"robot's data sheet"
+            )
+    wide = [
+        n for n, r in zip(body.joints, limits["position"], strict=True) if np.ptp(r) > 4 * np.pi
+    ]
+    if wide:
+        found.append(f"the range of {_listed(wide)} is more than two turns: check it")
+    return found
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more joints"
+
+
+def _unlike(source: Path, what: str, value: object, expected: str) -> SpecificationError:
+    return SpecificationError(
+        f"{what} in {source} is {value!r}, but {expected} is expected: correct it."
+    )
+
+
+__all__ = ["KINDS", "Limits"]

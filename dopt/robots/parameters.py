@@ -1,0 +1,385 @@
+"""Unknown parameters of a robot: what torques say of them, and what they cannot say.
+
+A torque is measured with white noise whose standard deviation is a share of the joint's limit. The
+information of a motion about the parameters p is the sum of (∂τ/∂p)ᵀ Σ⁻¹ ∂τ/∂p over its samples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.optimize
+
+from dopt.errors import SpecificationError, unknown_name
+from dopt.robots.body import INERTIAL, Body, Motion, _rotation, inertial_row
+from dopt.robots.limits import Limits
+from dopt.types import Array
+
+OF_BODIES = {
+    "mass": ("mass",),
+    "com": ("com_x", "com_y", "com_z"),
+    "inertia": ("Ix", "Iy", "Iz"),
+}
+"""Kinds of parameters of a body, and the parameters that each stands for.
+
+Centres are in the body's frame, inertias are principal moments about the centre.
+"""
+
+OF_JOINTS = ("armature", "damping", "frictionloss", "gear")
+"""Kinds of parameters of a joint. A gear is the ratio of torque and command."""
+
+UNITS = {
+    **{"mass": "kg", "com_x": "m", "com_y": "m", "com_z": "m"},
+    **{"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "armature": "kg m²"},
+    **{"damping": "N m s/rad", "frictionloss": "N m", "gear": ""},
+}
+
+FRICTION = 0.05
+"""Share of the limit of torque that friction is taken to be where the file has none."""
+
+SLOW = 0.01
+"""Share of the limit of velocity at which dry friction has 76 % of its value."""
+
+NULL = 1e-9
+"""Share of the largest singular value below which a combination of parameters has no effect.
+
+Files give angles to 9 digits or more: what is null with exact ones is below it.
+"""
+
+SMALL = 1e-5
+"""Share of the largest part of a combination below which a part is left out."""
+
+WEAK = 1.0
+"""Standard error, as a share of the parameter, from which a parameter is called weak."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One unknown number.
+
+    Attributes
+    ----------
+    kind : str
+        Name in ``UNITS``.
+    place : str
+        Its body or joint.
+    value : float
+        Nominal value.
+    scale : float
+        Size that errors are relative to: the nominal value, or a typical one where that is 0.
+    """
+
+    kind: str
+    place: str
+    value: float
+    scale: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind}:{self.place}"
+
+    @property
+    def unit(self) -> str:
+        return UNITS[self.kind]
+
+
+class Unknowns:
+    """The unknown parameters of a body.
+
+    Parameters
+    ----------
+    body : Body
+    limits : Limits
+    wanted : str or sequence of str
+        Kinds, each for all places or for one: ``"damping,frictionloss,mass:link7"``. Kinds are
+        mass, com, inertia (of bodies), armature, damping, frictionloss, gear (of joints), and
+        single parameters of them such as com_x; ``all`` stands for all kinds. Places may hold
+        wildcards, ``mass:link*``.
+    noise : float
+        Standard deviation of a measured torque, as a share of the limit.
+
+    Attributes
+    ----------
+    parameters : tuple of Parameter
+        The p parameters.
+
+    Raises
+    ------
+    SpecificationError
+        If a kind or a place is not known.
+    """
+
+    def __init__(
+        self, body: Body, limits: Limits, wanted: str | Sequence[str], noise: float = 0.01
+    ) -> None:
+        self.body, self.limits, self.noise = body, limits, noise
+        names = wanted.split(",") if isinstance(wanted, str) else list(wanted)
+        found: dict[str, Parameter] = {}
+        for name in filter(None, (one.strip() for one in names)):
+            for parameter in self._matching(name):
+                found[parameter.name] = parameter
+        if not found:
+            raise SpecificationError(
+                f"no unknown parameter is given, but at least one is expected: give some of "
+                f"{', '.join([*OF_BODIES, *OF_JOINTS])}."
+            )
+        self.parameters = tuple(found.values())
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(one.name for one in self.parameters)
+
+    @property
+    def scales(self) -> Array:
+        return np.array([one.scale for one in self.parameters])
+
+    @property
+    def values(self) -> Array:
+        return np.array([one.value for one in self.parameters])
+
+    def _matching(self, name: str) -> list[Parameter]:
+        """Return the parameters that a name such as ``mass:link7`` stands for."""
+        kind, _, place = name.partition(":")
+        kinds: tuple[str, ...] = OF_BODIES.get(kind, (kind,))
+        if kind == "all":
+            kinds = tuple(UNITS)
+        known = [*OF_BODIES, *UNITS, "all"]
+        if not set(kinds) <= set(UNITS):
+            raise unknown_name("kind of parameter", kind, dict.fromkeys(known))
+        found = [
+            self._parameter(one, where)
+            for where in dict.fromkeys(self.body.bodies + self.body.joints)
+            for one in kinds
+            if where in (self.body.joints if one in OF_JOINTS else self.body.bodies)
+            and (not place or fnmatch.fnmatchcase(where, place))
+        ]
+        if not found:
+            places = self.body.joints if kind in OF_JOINTS else self.body.bodies
+            raise unknown_name("joint" if kind in OF_JOINTS else "body", place, places)
+        return found
+
+    def _parameter(self, kind: str, place: str) -> Parameter:
+        model = self.body.model
+        if kind in OF_JOINTS:
+            k = self.body.joints.index(place)
+            dof = self.body.dofs[k]
+            typical = FRICTION * self.limits.torque[k]
+            value, usual = {
+                "armature": (model.dof_armature[dof], 0.1 * self._inertia(k)),
+                "damping": (model.dof_damping[dof], typical / self.limits.velocity[k]),
+                "frictionloss": (model.dof_frictionloss[dof], typical),
+                "gear": (1.0, 1.0),
+            }[kind]
+            return Parameter(kind, place, float(value), float(value or usual))
+        b = self.body.moved[self.body.bodies.index(place)]
+        mass, moments = float(model.body_mass[b]), np.array(model.body_inertia[b])
+        if kind == "mass":
+            return Parameter(kind, place, mass, mass or 1.0)
+        axis = "xyz".index(kind[-1])
+        if kind.startswith("com"):
+            # A centre at 0 has the size of the body, by its radius of gyration.
+            away = np.linalg.norm(model.body_ipos[b])
+            size = max(float(np.sqrt(moments.mean() / max(mass, 1e-9))), float(away), 1e-3)
+            return Parameter(kind, place, float(model.body_ipos[b][axis]), size)
+        return Parameter(kind, place, float(moments[axis]), float(moments[axis]) or 1e-3)
+
+    def _inertia(self, k: int) -> float:
+        """Return the inertia that joint ``k`` moves at home."""
+        still = np.zeros((2, self.body.n))
+        pushed = still.copy()
+        pushed[1, k] = 1.0
+        home = np.tile(self.body.home, (2, 1))
+        torques = self.body.torques(Motion(1.0, home, still, pushed))
+        return float(torques[1, k] - torques[0, k])
+
+    def regressor(self, motion: Motion, rigid: Array | None = None) -> Array:
+        """Return ∂τ/∂p in relative units, (T, n, p): torque for a parameter off by its scale.
+
+        ``rigid`` is the regressor of the body, where it is known already.
+        """
+        body, model = self.body, self.body.model
+        result = np.zeros((len(motion.positions), body.n, len(self)))
+        inertial = [i for i, one in enumerate(self.parameters) if one.kind not in OF_JOINTS]
+        needs_torques = any(one.kind == "gear" for one in self.parameters)
+        if inertial or needs_torques:
+            rows = body.regressor(motion) if rigid is None else rigid
+            result[:, :, inertial] = rows @ self._inertial_directions(inertial)
+        if needs_torques:
+            friction = model.dof_damping[body.dofs] * motion.velocities
+            friction += model.dof_frictionloss[body.dofs] * self._signs(motion)
+            torques = rows @ body.inertial + friction
+            torques += model.dof_armature[body.dofs] * motion.accelerations
+        for i, one in enumerate(self.parameters):
+            if one.kind not in OF_JOINTS:
+                continue
+            k = body.joints.index(one.place)
+            if one.kind == "gear":
+                result[:, k, i] = -torques[:, k]
+            elif one.kind == "frictionloss":
+                result[:, k, i] = self._signs(motion)[:, k]
+            else:
+                moved = motion.accelerations if one.kind == "armature" else motion.velocities
+                result[:, k, i] = moved[:, k]
+        scaled: Array = result * self.scales
+        return scaled
+
+    def _signs(self, motion: Motion) -> Array:
+        """Return the signs of the velocities, smooth about 0, (T, n)."""
+        result: Array = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
+        return result
+
+    def _inertial_directions(self, places: list[int]) -> Array:
+        """Return the change of the inertial parameters with each unknown one, (10 · bodies, p)."""
+        body, model = self.body, self.body.model
+        result = np.zeros((INERTIAL * len(body.bodies), len(places)))
+        for i, place in enumerate(places):
+            one = self.parameters[place]
+            which = body.bodies.index(one.place)
+            b = body.moved[which]
+            mass, c = float(model.body_mass[b]), np.array(model.body_ipos[b])
+            axis = "xyz".find(one.kind[-1])
+            unit = np.eye(3)[axis]
+            if one.kind == "mass":
+                change = inertial_row(1.0, c, c @ c * np.eye(3) - np.outer(c, c))
+            elif one.kind.startswith("com"):
+                about = 2.0 * c[axis] * np.eye(3) - np.outer(unit, c) - np.outer(c, unit)
+                change = inertial_row(0.0, mass * unit, mass * about)
+            else:
+                axes = _rotation(model.body_iquat[b])
+                change = inertial_row(0.0, np.zeros(3), np.outer(axes[:, axis], axes[:, axis]))
+            result[INERTIAL * which : INERTIAL * (which + 1), i] = change
+        return result
+
+    def information(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
+        """Return the information of a motion in relative units, (p, p).
+
+        Parameters
+        ----------
+        motion : Motion
+        rate : float
+            Independent measurements of each torque in a second [Hz].
+        """
+        flat = self.weighted(motion, rate, rigid).reshape(-1, len(self))
+        result: Array = flat.T @ flat
+        return result
+
+    def weighted(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
+        """Return the regressor in units of the noise, (T, n, p), as of ``rate`` rows a second."""
+        noise = self.noise * self.limits.torque
+        result: Array = self.regressor(motion, rigid) * (np.sqrt(rate * motion.dt) / noise)[:, None]
+        return result
+
+
+@dataclasses.dataclass(frozen=True)
+class Identifiability:
+    """What an information, (p, p) in relative units, says of the parameters.
+
+    Attributes
+    ----------
+    errors : (p,)
+        Standard errors as shares of each parameter, given that every parameter is known to about
+        its own size before (a prior standard deviation of 1).
+    null : list of str
+        Combinations that no motion of this kind changes, in words.
+    weak : list of str
+        Parameters whose standard error without a prior is above ``WEAK`` of their size.
+    """
+
+    names: tuple[str, ...]
+    errors: Array
+    null: list[str]
+    weak: list[str]
+
+    @classmethod
+    def of(cls, unknowns: Unknowns, motion: Motion, rate: float) -> Identifiability:
+        """Examine a motion, of which each torque is measured at a rate [Hz]."""
+        rows = unknowns.weighted(motion, rate).reshape(-1, len(unknowns))
+        sizes = np.linalg.norm(rows, axis=0)
+        dead = sizes <= NULL * sizes.max()  # of columns that rounding alone fills
+        sizes[dead] = np.inf
+        _, values, vectors = np.linalg.svd(np.linalg.qr(rows / sizes, mode="r"))
+        sizes[dead] = 1.0
+        lost = values <= NULL * values[0]
+        null = vectors[lost] / sizes
+        basis = _sparse(null / np.abs(null).max(axis=1, keepdims=True))
+        touched = np.abs(basis).max(axis=0, initial=0.0) > SMALL
+        alone = np.linalg.norm(vectors[~lost].T / values[~lost], axis=1) / sizes
+        weak = [
+            f"{one.name} ({100.0 * error:.0f} %)"
+            for one, error, is_null in zip(unknowns.parameters, alone, touched, strict=True)
+            if error > WEAK and not is_null
+        ]
+        errors = relative_errors(rows.T @ rows)
+        return cls(unknowns.names, errors, [_words(row, unknowns) for row in basis], weak)
+
+
+def relative_errors(information: Array) -> Array:
+    """Return standard errors with a prior of standard deviation 1, (p,)."""
+    covariance = np.linalg.inv(information + np.eye(len(information)))
+    result: Array = np.sqrt(np.diag(covariance))
+    return result
+
+
+def _sparse(rows: Array) -> Array:
+    """Return a basis of the space of some rows, (k, p), that has few parts other than 0.
+
+    Of the space, the vector with the least sum of magnitudes is taken for each parameter that is to
+    be 1 in it; of these the sparsest that are independent.
+    """
+    k, p = rows.shape
+    if not k:
+        return rows
+    found = []
+    for i in np.flatnonzero(np.abs(rows).max(axis=0) > SMALL):
+        # rowsᵀ c = a - b with a, b >= 0, least sum of a + b.
+        one = scipy.optimize.linprog(
+            np.concatenate([np.zeros(k), np.ones(2 * p)]),
+            A_eq=np.vstack(
+                [np.hstack([rows.T, -np.eye(p), np.eye(p)]), [*rows[:, i], *np.zeros(2 * p)]]
+            ),
+            b_eq=[*np.zeros(p), 1.0],
+            bounds=[(None, None)] * k + [(0.0, None)] * (2 * p),
+        )
+        if one.success and one.x is not None:
+            vector = one.x[:k] @ rows
+            found.append(np.where(np.abs(vector) > SMALL * np.abs(vector).max(), vector, 0.0))
+    found.sort(key=np.count_nonzero)
+    basis: list[Array] = []
+    for vector in found:
+        together = np.array([*basis, vector])
+        together /= np.linalg.norm(together, axis=1, keepdims=True)
+        if np.linalg.svd(together, compute_uv=False)[-1] > SMALL:
+            basis.append(vector)
+    return np.array(basis).reshape(-1, p)
+
+
+def _words(row: Array, unknowns: Unknowns) -> str:
+    """Return a null direction in words: what cannot be told apart."""
+    row = row / np.abs(row).max()
+    parts = [i for i in np.argsort(-np.abs(row), kind="stable") if abs(row[i]) > SMALL]
+    if len(parts) == 1:
+        return f"{unknowns.names[parts[0]]} has no effect"
+    shown = unknowns.scales * row
+    unit = abs(shown[parts[0]]) * np.sign(shown[min(parts)])
+    named = [f"{_times(shown[i] / unit)}{unknowns.names[i]}" for i in sorted(parts)]
+    text = " + ".join(named[:_SHOWN]).replace("+ −", "− ")
+    more = f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else ""
+    return f"{text}{more}"
+
+
+_SHOWN = 6
+
+
+def _times(factor: float) -> str:
+    text = f"{abs(factor):.3g}"
+    sign = "−" if factor < 0 else ""
+    return sign if text == "1" else f"{sign}{text} · "
+
+
+__all__ = ["Identifiability", "Parameter", "Unknowns", "relative_errors"]

@@ -1,0 +1,145 @@
+"""Tracking of references by a robot: its known body, its observed state, and computed torques."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from dopt.robots.body import Body
+from dopt.robots.limits import Limits
+from dopt.types import Array
+
+BANDWIDTH = 40.0
+"""Natural frequency of errors of tracking [rad/s]; they are damped critically."""
+
+CORRECTION = 0.5, 0.1
+"""Parts of an innovation that correct the observed position, and the rate times dt."""
+
+
+class KnownBody:
+    """Inverse dynamics of a body at 500 Hz, without friction, contacts and limits.
+
+    Joints that are not driven stay at rest.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self.body, self.model = body, copy.copy(body.model)
+        self.model.opt.disableflags |= (
+            mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        )
+        self.model.dof_damping[:] = 0.0
+        self.model.dof_frictionloss[:] = 0.0
+        self._data = mujoco.MjData(self.model)
+        self._unit, self._column = np.zeros(self.model.nv), np.zeros(self.model.nv)
+
+    def inverse(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the torques [N m], (n,), that accelerate the body so."""
+        data, dofs = self._data, self.body.dofs
+        data.qpos[self.body.addresses] = q
+        data.qvel[dofs] = v
+        data.qacc[dofs] = a
+        mujoco.mj_inverse(self.model, data)
+        return np.array(data.qfrc_inverse[dofs])
+
+    def mass_matrix(self) -> Array:
+        """Return M, (n, n), at the position of the last call of :meth:`inverse`."""
+        dofs = self.body.dofs
+        M = np.empty((len(dofs), len(dofs)))
+        for k, dof in enumerate(dofs):
+            self._unit[dof] = 1.0
+            mujoco.mj_mulM(self.model, self._data, self._column, self._unit)
+            self._unit[dof] = 0.0
+            M[k] = self._column[dofs]
+        return M
+
+    def hang(self, mass: float, moment: Array) -> None:
+        """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
+        model, last = self.model, self.body.moved[-1]
+        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
+        total = own + mass
+        model.body_mass[last] = total
+        model.body_ipos[last] = (own * centre + moment) / total
+        if mass > 0.0:
+            away = moment / mass - centre
+            model.body_inertia[last] += own * mass / total * (away @ away)
+        mujoco.mj_setConst(model, self._data)
+
+
+class Tracker:
+    """Observer of rates and computed torque with friction fed forward.
+
+    Parameters
+    ----------
+    known : KnownBody
+    limits : Limits
+    friction : function
+        Friction learned so far [N m], (n,), at velocities, (n,).
+    dt : float
+        Period of control [s].
+
+    Attributes
+    ----------
+    q, v : (n,)
+        Observed position and velocity.
+    """
+
+    def __init__(
+        self, known: KnownBody, limits: Limits, friction: Callable[[Array], Array], dt: float
+    ) -> None:
+        self.known, self.limits, self.friction, self.dt = known, limits, friction, dt
+        self.q: Array = np.array(known.body.home)
+        self.v: Array = np.zeros(len(self.q))
+
+    def place(self, q: Array) -> None:
+        """Begin at rest at a position, (n,)."""
+        self.q, self.v = np.array(q, dtype=float), np.zeros(len(q))
+
+    def predict(self, a: Array) -> None:
+        """Move the observed state by a period with the acceleration that is expected, (n,)."""
+        self.q = self.q + self.dt * (self.v + 0.5 * self.dt * a)
+        self.v = self.v + self.dt * a
+
+    def correct(self, q: Array) -> None:
+        """Correct the observed state by a measured position, (n,)."""
+        missed, (of_position, of_rate) = q - self.q, CORRECTION
+        self.q = self.q + of_position * missed
+        self.v = self.v + of_rate / self.dt * missed
+
+    def torque(self, q: Array, v: Array, a: Array) -> Array:
+        """Return torques [N m], (n,), that follow a reference, within their limits."""
+        wanted = a + BANDWIDTH**2 * (q - self.q) + 2.0 * BANDWIDTH * (v - self.v)
+        demand = self.known.inverse(self.q, self.v, wanted) + self.friction(v)
+        clipped: Array = np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
+        return clipped
+
+    def lag(self, torque: Array) -> Array:
+        """Return the error of position, (n,), that feeds back a torque [N m], (n,).
+
+        A reference that is moved back by what a better feedforward makes up for does not hurry.
+        """
+        fed: Array = np.linalg.solve(self.known.mass_matrix(), torque).astype(float)
+        return fed / BANDWIDTH**2
+
+
+def possible_acceleration(
+    known: KnownBody, limits: Limits, share: float = 0.7
+) -> tuple[Array, Array]:
+    """Return accelerations within limits that a share of the torques allows, and inertias: (n,).
+
+    Gravity and the joint's own inertia are looked at in 200 random positions; the largest counts.
+    """
+    random, n = np.random.default_rng(0), len(limits.torque)
+    least, largest = np.array(limits.acceleration, dtype=float), np.zeros(n)
+    low, high = limits.position.T
+    for q in low + (high - low) * random.random((200, n)):
+        held = np.abs(known.inverse(q, np.zeros(n), np.zeros(n)))
+        own = np.diag(known.mass_matrix())
+        least = np.minimum(least, np.maximum(share * limits.torque - held, 0.0) / own)
+        largest = np.maximum(largest, own)
+    return least, largest
+
+
+__all__ = ["BANDWIDTH", "KnownBody", "Tracker", "possible_acceleration"]

@@ -1,0 +1,312 @@
+"""Families of excitation trajectories: each turns standard normal numbers into a motion in limits.
+
+Motions begin and end at rest. Multisines and Fourier series: J. Swevers et al., "Optimal robot
+excitation and identification", IEEE Trans. Robotics and Automation 13, 5 (1997). Ladders move each
+joint by segments of constant speed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from scipy.special import ndtr
+
+from dopt.robots.body import Motion
+from dopt.robots.limits import Limits
+from dopt.types import Array
+
+RAMP = 2.0
+"""Most seconds in which a series begins, and in which it ends; a tenth of short ones."""
+
+ROOM = 0.95
+"""Share of the ranges of position and of the limits of rates that a motion uses."""
+
+SLOWEST = 0.02
+"""Share of the limit of velocity of a ladder's slowest segment."""
+
+SEGMENT = 0.5
+"""Seconds of a ladder's segment at the least."""
+
+HARMONICS = 10
+"""Harmonics of a Fourier series."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Family(ABC):
+    """Motions of one kind.
+
+    Parameters
+    ----------
+    limits : Limits
+    seconds : float
+        Duration [s].
+    """
+
+    limits: Limits
+    seconds: float
+
+    @property
+    def n(self) -> int:
+        return len(self.limits.velocity)
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Name in tables."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Count of the numbers that a motion is made from."""
+
+    @abstractmethod
+    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
+        """Return the motion of some numbers, (size,), normally distributed in a first draw.
+
+        Parameters
+        ----------
+        numbers : (size,)
+        dt : float
+            Time from one row to the next [s].
+        reach : float
+            Share of its amplitude that the motion has, for torques and collisions.
+        """
+
+    def _centres(self, numbers: Array) -> Array:
+        """Return the positions about which joints move, (n,): the middle third of the ranges."""
+        half = ROOM * np.diff(self.limits.position, axis=1)[:, 0] / 2.0
+        result: Array = self.limits.middle + half / 3.0 * np.tanh(numbers)
+        return result
+
+
+@dataclasses.dataclass(frozen=True)
+class Fourier(Family):
+    """Periodic series of :data:`HARMONICS` harmonics, about a centre.
+
+    Parameters
+    ----------
+    period : float
+        Longest period [s].
+    """
+
+    period: float = 10.0
+
+    @property
+    def name(self) -> str:
+        return f"Fourier, {self.period:g} s"
+
+    @property
+    def size(self) -> int:
+        return self.n * (2 * HARMONICS + 1)
+
+    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
+        parts = numbers.reshape(2 * HARMONICS + 1, self.n)
+        rates: Array = 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
+        cosines, sines = parts[1 : HARMONICS + 1], parts[HARMONICS + 1 :]
+        return self._series(rates, cosines, sines, self._centres(parts[0]), dt, reach)
+
+    def _series(
+        self, rates: Array, cosines: Array, sines: Array, centres: Array, dt: float, reach: float
+    ) -> Motion:
+        """Return Σ (a cos ωt + b sin ωt)/ω between ramps, as large as the limits allow."""
+        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        phase = np.outer(t, rates)
+        c, s = np.cos(phase), np.sin(phase)
+        a, b = cosines / rates[:, None], sines / rates[:, None]
+        shape = c @ a + s @ b
+        rate = (-s * rates) @ a + (c * rates) @ b
+        turn = -(c * rates**2) @ a - (s * rates**2) @ b
+        w, w1, w2 = (one[:, None] for one in _ramps(t, self.seconds))
+        positions = w * shape
+        velocities = w1 * shape + w * rate
+        accelerations = w2 * shape + 2.0 * w1 * rate + w * turn
+        half = np.diff(self.limits.position, axis=1)[:, 0] / 2.0
+        room = half - np.abs(centres - self.limits.middle) / ROOM
+        taken = np.max(
+            [
+                np.abs(positions).max(axis=0) / room,
+                np.abs(velocities).max(axis=0) / self.limits.velocity,
+                np.abs(accelerations).max(axis=0) / self.limits.acceleration,
+            ],
+            axis=0,
+        )
+        size = reach * ROOM / np.maximum(taken, 1e-12)
+        return Motion(dt, centres + size * positions, size * velocities, size * accelerations)
+
+
+@dataclasses.dataclass(frozen=True)
+class Multisine(Fourier):
+    """Sum of sines with random phases, up to ``fastest`` Hz, whose velocities are equally large."""
+
+    fastest: float = 2.0
+
+    @property
+    def name(self) -> str:
+        return "multisine"
+
+    @property
+    def _lines(self) -> int:
+        return max(3, int(min(self.fastest * self.seconds, 20)))
+
+    @property
+    def size(self) -> int:
+        return self.n * (2 * self._lines + 1)
+
+    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
+        lines = self._lines
+        parts = numbers.reshape(2 * lines + 1, self.n)
+        cosines, sines = parts[1 : lines + 1], parts[lines + 1 :]
+        sizes = np.hypot(cosines, sines)
+        rates = 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
+        centres = self._centres(parts[0])
+        return self._series(rates, cosines / sizes, sines / sizes, centres, dt, reach)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ladder(Family):
+    """Segments of constant speed for each joint, between smooth ramps.
+
+    Numbers choose the speeds, a log-uniform draw, and the places of the start. A segment moves to
+    the side that has more room, and ends where the room does.
+    """
+
+    @property
+    def name(self) -> str:
+        return "ladder"
+
+    @property
+    def segments(self) -> int:
+        """Most segments of a joint."""
+        return max(2, round(self.seconds / SEGMENT))
+
+    @property
+    def size(self) -> int:
+        return self.n * (self.segments + 1)
+
+    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
+        parts = numbers.reshape(self.segments + 1, self.n)
+        centres = self._centres(parts[0])
+        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        columns = []
+        for k in range(self.n):
+            low, high = self.limits.position[k]
+            middle, half = (low + high) / 2.0, reach * ROOM * (high - low) / 2.0
+            path = Path1(
+                float(centres[k]),
+                (middle - half, middle + half),
+                ROOM * self.limits.acceleration[k],
+            )
+            for number in parts[1:, k]:
+                share = SLOWEST ** (1.0 - ndtr(number))
+                path.move(reach * ROOM * self.limits.velocity[k] * share, SEGMENT, t[-1])
+            path.rest(t[-1])
+            columns.append(path.sampled(t))
+        q, v, a = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
+        return Motion(dt, q, v, a)
+
+
+class Path1:
+    """Path of one joint at constant speeds, between ramps without jumps of the acceleration.
+
+    Parameters
+    ----------
+    start : float
+        Position at which it begins, at rest.
+    room : tuple of float
+        Least and largest position.
+    acceleration : float
+        Largest magnitude, in the middle of each ramp.
+    """
+
+    def __init__(self, start: float, room: tuple[float, float], acceleration: float) -> None:
+        self.room, self._mean = room, acceleration / 1.5  # by a ramp v = 3 s² - 2 s³
+        self._times, self._speeds = [0.0], [0.0]
+        self.position = float(np.clip(start, *room))
+        self._start = self.position
+
+    @property
+    def now(self) -> float:
+        return self._times[-1]
+
+    @property
+    def speed(self) -> float:
+        return self._speeds[-1]
+
+    def _to(self, speed: float, seconds: float) -> None:
+        if seconds > 1e-9:
+            self.position += 0.5 * (self.speed + speed) * seconds
+            self._times.append(self.now + seconds)
+            self._speeds.append(speed)
+
+    def _way(self, speed: float) -> float:
+        """Return the way from a speed to rest."""
+        return speed * abs(speed) / (2.0 * self._mean)
+
+    def move(self, magnitude: float, seconds: float, end: float) -> None:
+        """Add a segment of a speed, whose sign has more room, that can still come to rest in it."""
+        sign = 1.0 if sum(self.room) >= 2.0 * (self.position + self._way(self.speed)) else -1.0
+        target = sign * magnitude
+        ramp = abs(target - self.speed) / self._mean
+        after = self.position + 0.5 * (self.speed + target) * ramp
+        wall = self.room[1] if sign > 0 else self.room[0]
+        left = sign * (wall - after) - self._way(magnitude)
+        hold = min(seconds, left / magnitude)
+        rest = end - self.now - magnitude / self._mean - ramp
+        turn = self.position + self._turn(target, ramp)
+        inside = self.room[0] - 1e-9 <= turn <= self.room[1] + 1e-9
+        if hold <= 0.0 or rest <= 0.0 or not inside:
+            self._brake(end)
+            return
+        self._to(target, ramp)
+        self._to(target, min(hold, rest))
+
+    def _turn(self, target: float, ramp: float) -> float:
+        """Return the way to the point where a ramp to another sign turns; 0 without one."""
+        if self.speed * target >= 0.0:
+            return 0.0
+        change = target - self.speed
+        s = 0.5 - math.sin(math.asin(1.0 + 2.0 * self.speed / change) / 3.0)
+        return ramp * (self.speed * s + change * (s**3 - 0.5 * s**4))
+
+    def _brake(self, end: float) -> None:
+        self._to(0.0, min(abs(self.speed) / self._mean, max(end - self.now, 0.0)))
+
+    def rest(self, end: float) -> None:
+        """Brake, and stay until the end."""
+        self._brake(end)
+        self._to(0.0, end - self.now)
+
+    def sampled(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations at some times, (T,) each."""
+        times, speeds = np.array(self._times), np.array(self._speeds)
+        steps, changes = np.diff(times), np.diff(speeds)
+        ways = np.cumsum((speeds[1:] + speeds[:-1]) / 2.0 * steps)
+        places = self._start + np.concatenate([[0.0], ways])
+        at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(steps) - 1)
+        s = np.clip((t - times[at]) / steps[at], 0.0, 1.0)
+        step, change = steps[at], changes[at]
+        positions = places[at] + step * (speeds[at] * s + change * (s**3 - 0.5 * s**4))
+        velocities = speeds[at] + change * s**2 * (3.0 - 2.0 * s)
+        return positions, velocities, change / step * 6.0 * s * (1.0 - s)
+
+
+def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
+    """Return a window that rises from 0 to 1 and falls again, and its two derivatives.
+
+    A quintic with no velocity and no acceleration at its ends.
+    """
+    ramp = min(RAMP, seconds / 10.0)
+    last = t[-1]
+    up, down = np.clip(t / ramp, 0.0, 1.0), np.clip((last - t) / ramp, 0.0, 1.0)
+    x = np.minimum(up, down)
+    sign = np.where(up <= down, 1.0, -1.0) / ramp
+    w = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    slope = 30.0 * x**2 * (1.0 - x) ** 2
+    bend = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
+    return w, sign * slope, bend / ramp**2
+
+
+__all__ = ["Family", "Fourier", "Ladder", "Multisine", "Path1"]

@@ -1,0 +1,1 @@
+"""Robots with a known body: what is learned while they move, in simulation."""

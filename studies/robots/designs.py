@@ -1,0 +1,230 @@
+"""Designs for many unknowns: expected errors by multisines, and errors of fits after them.
+
+``python -m studies.robots.designs --urdf MODEL --limits FILE --seeds 20`` appends a row for each
+arm and seed to ``docs/robots_designs.csv``. The seed draws the multisines, the search, and a robot
+whose parameters differ from the file's by 10 % of each one's size; torques are measured with white
+noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import csv
+import sys
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.signal import savgol_filter
+
+from dopt.robots.body import Body, Motion
+from dopt.robots.design import Design, Problem
+from dopt.robots.limits import Limits
+from dopt.robots.parameters import SLOW, Identifiability, Parameter, Unknowns
+from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.types import Array
+from studies.robots.simulated import CONTROL, Friction, SimulatedRobot, iiwa, jaco
+
+FILE = Path("docs/robots_designs.csv")
+
+UNKNOWN = "mass,com,inertia,armature,damping,frictionloss,gear"
+
+OFF = 0.1
+"""Standard deviation of a true parameter about the file's, by its size."""
+
+WINDOW = 31
+"""Samples of a local cubic: 62 ms."""
+
+TURNING = 0.05
+"""Share of the limit of velocity below which a joint is left out of the fit.
+
+There the noise of the velocity bends the mean of dry friction.
+"""
+
+KNOWN = 0.3
+"""Expected relative error below which a fit is compared with it."""
+
+
+def changed(body: Body, parameters: tuple[Parameter, ...], values: Array) -> tuple[Body, Array]:
+    """Return the body with other inertial parameters, and the gears, (n,)."""
+    model, gears = copy.copy(body.model), np.ones(body.n)
+    for one, value in zip(parameters, values, strict=True):
+        if one.place in body.joints:
+            k = body.joints.index(one.place)
+            if one.kind == "gear":
+                gears[k] = value
+            else:
+                getattr(model, f"dof_{one.kind}")[body.dofs[k]] = value
+            continue
+        b = body.moved[body.bodies.index(one.place)]
+        axis = "xyz".find(one.kind[-1])
+        if one.kind == "mass":
+            model.body_mass[b] = value
+        elif one.kind.startswith("com"):
+            model.body_ipos[b, axis] = value
+        else:
+            model.body_inertia[b, axis] = value
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return Body(model, body.source), gears
+
+
+def measured(robot: SimulatedRobot, nominal: Body, gears: Array, motion: Motion) -> Array:
+    """Track a motion with the nominal body; return positions and commands, (T, 2, n)."""
+    model, friction = nominal.model, nominal.dofs
+    damping, dry = model.dof_damping[friction], model.dof_frictionloss[friction]
+    speed = SLOW * robot.limits.velocity
+
+    def expected(v: Array) -> Array:
+        torques: Array = damping * v + dry * np.tanh(v / speed)
+        return torques
+
+    tracker = Tracker(KnownBody(nominal), robot.limits, expected, CONTROL)
+    robot.place(motion.positions[0])
+    tracker.place(motion.positions[0])
+    rows = []
+    for k in range(len(motion.positions)):
+        q, _ = robot.state()
+        if k:
+            tracker.predict(motion.accelerations[k - 1])
+            tracker.correct(q)
+        torque = tracker.torque(motion.positions[k], motion.velocities[k], motion.accelerations[k])
+        robot.step(gears * torque)
+        rows.append((q, torque))
+    return np.array(rows)
+
+
+def smoothed(rows: Array, reference: Motion) -> Motion:
+    """Return the motion that encoders have seen: the reference and its error, smoothed.
+
+    The error is a response to the noise of the torques, within the bandwidth of the tracking; local
+    cubics estimate it and its two derivatives. Speeds of a ladder stay as sharp as they are.
+    """
+    error = rows[:, 0] - reference.positions
+    q, v, a = (
+        savgol_filter(error, WINDOW, 3, deriv=order, delta=CONTROL, axis=0) for order in range(3)
+    )
+    parts = reference.positions + q, reference.velocities + v, reference.accelerations + a
+    return held(Motion(CONTROL, *parts))
+
+
+def held(motion: Motion) -> Motion:
+    """Return the means of a motion while each torque is held, without its ends."""
+    inner = slice(WINDOW, -WINDOW)
+    q, v = motion.positions, motion.velocities
+    positions, velocities = (0.5 * (part[1:] + part[:-1])[inner] for part in (q, v))
+    return Motion(CONTROL, positions, velocities, (np.diff(v, axis=0) / CONTROL)[inner])
+
+
+def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
+    """Return the relative changes of the parameters by three steps of Gauss and Newton, (p,).
+
+    Regressors at the reference, which has no noise, are the instruments: A. Janot, P.-O. Vandanjon,
+    M. Gautier, "A generic instrumental variable approach for industrial robot identification", IEEE
+    Trans. Control Systems Technology 22, 1 (2014). Least squares alone would be biased by the noise
+    of the encoders.
+    """
+    motion, commands = smoothed(rows, reference), rows[:-1, 1][WINDOW:-WINDOW]
+    planned = held(reference)
+    first, found = problem.unknowns, np.zeros(len(problem.unknowns))
+    slow = SLOW * problem.limits.velocity
+    noise = first.noise * problem.limits.torque / np.sqrt(problem.rate * CONTROL)
+    for _ in range(3):
+        values = first.values + found * first.scales
+        body, gears = changed(problem.body, first.parameters, values)
+        unknowns = Unknowns(body, problem.limits, UNKNOWN, first.noise)
+        damping, dry = body.model.dof_damping[body.dofs], body.model.dof_frictionloss[body.dofs]
+        v = motion.velocities
+        expected = body.torques(motion) + damping * v + dry * np.tanh(v / slow)
+        scale = first.scales / unknowns.scales / (gears * noise)[:, None]
+        x, z = (
+            (unknowns.regressor(one) * scale).reshape(-1, len(found)) for one in (motion, planned)
+        )
+        z[(np.abs(planned.velocities) < TURNING * problem.limits.velocity).reshape(-1)] = 0.0
+        left = ((commands - expected / gears) / noise).reshape(-1)
+        found = found + np.linalg.solve(z.T @ x + np.eye(len(found)), z.T @ left - found)
+    return found
+
+
+def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[str, object]:
+    """Design, simulate a robot on the motion, fit, and compare."""
+    began = time.process_time()
+    problem = Problem(body, limits, UNKNOWN, 20.0, nuisance="")
+    design = Design.of(problem, seed=seed, effort=effort)
+    spent = time.process_time() - began
+    best = design.best
+    seen = Identifiability.of(problem.unknowns, best.motion(0.04), problem.rate)
+    known = design.reference < 0.5
+    ratio = best.errors / design.reference
+    rng = np.random.default_rng([seed, 47])
+    off = OFF * rng.standard_normal(problem.count)
+    centres = np.array([one.kind.startswith("com") for one in problem.requested])
+    off = np.where((problem.unknowns.values == 0.0) & ~centres, np.abs(off), off)
+    values = problem.unknowns.values + off * problem.unknowns.scales
+    true, gears = changed(body, problem.requested, values)
+    model = true.model
+    friction = Friction(
+        coulomb=np.abs(model.dof_frictionloss[true.dofs]),
+        viscous=np.abs(model.dof_damping[true.dofs]),
+        stribeck=np.zeros(body.n),
+        width=np.ones(body.n),
+        smooth=SLOW * limits.velocity,
+    )
+    robot = SimulatedRobot(true, limits, seed, friction, noise=0.0, ripple=0.0)
+    motion = best.motion(CONTROL)
+    rows = measured(robot, body, gears, motion)
+    rows[:, 1] += problem.unknowns.noise * limits.torque * rng.standard_normal(rows[:, 1].shape)
+    found = fitted(problem, rows, motion)
+    sure = best.errors < KNOWN
+    z = ((found - off) / best.errors)[sure]
+    return {
+        "arm": arm,
+        "seed": seed,
+        "motion": best.name,
+        "unknowns": problem.count,
+        "null": len(seen.null),
+        "known": int(known.sum()),
+        "ratio": float(np.exp(np.log(ratio[known]).mean())),
+        "ratio_all": float(np.exp(np.log(ratio).mean())),
+        "worst": float(ratio.max()),
+        "share": best.share,
+        "achieved": float(np.sqrt((z**2).mean())),
+        "achieved_worst": float(np.abs(z).max()),
+        "cpu_seconds": spent,
+    }
+
+
+def main() -> None:
+    """Append the rows that are missing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--urdf", type=Path, help="URDF of the iiwa")
+    parser.add_argument("--limits", type=Path, help="its limits")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--effort", type=int, default=600)
+    given = parser.parse_args()
+    arms = {"jaco": jaco()} | ({"iiwa": iiwa(given.urdf, given.limits)} if given.urdf else {})
+    done = set()
+    if FILE.exists():
+        with FILE.open() as file:
+            done = {(one["arm"], int(one["seed"])) for one in csv.DictReader(file)}
+    for seed in range(given.seeds):
+        for arm, (body, limits) in arms.items():
+            if (arm, seed) in done:
+                continue
+            if arm == "jaco":
+                possible, _ = possible_acceleration(KnownBody(body), limits)
+                limits = Limits(limits.position, limits.velocity, possible, limits.torque)
+            one = row(arm, body, limits, seed, given.effort)
+            with FILE.open("a", newline="") as file:
+                writer = csv.DictWriter(file, one)
+                if not file.tell():
+                    writer.writeheader()
+                writer.writerow(
+                    {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in one.items()}
+                )
+            sys.stdout.write(f"{arm} {seed}: {one['ratio']:.3f} of the multisines\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""Torques, regressors, limits and collisions of a robot, against MuJoCo."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dopt.errors import SpecificationError
+from dopt.robots.body import Body, Motion
+from dopt.robots.limits import Limits
+from dopt.robots.parameters import Identifiability, Unknowns, relative_errors
+
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
+
+ARM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.002" gravity="0.3 -0.2 -9.81"/>
+  <worldbody>
+    <body name="base" pos="0.1 0.2 0.3" euler="0.2 0.1 -0.4">
+      <joint name="turn" axis="0 0 1" range="-2 2" pos="0.02 -0.03 0.1" armature="0.01"/>
+      <inertial pos="0.05 0.02 0.1" mass="2" fullinertia="0.03 0.02 0.04 0.003 -0.002 0.001"/>
+      <body name="link" pos="0.2 0 0.1" quat="0.9 0.1 0.3 0.2">
+        <joint name="slide" type="slide" axis="1 0.5 0" range="-0.3 0.3" stiffness="7"
+               springref="0.05"/>
+        <inertial pos="-0.02 0.1 0.03" mass="1.5" fullinertia="0.02 0.03 0.03 -0.002 0.004 0.002"/>
+        <body name="hand" pos="0 0.3 0" euler="1 0 0.3" gravcomp="0.4">
+          <joint name="lift" axis="0 1 0" range="-1.5 1.5" ref="0.2" damping="0.4"/>
+          <joint name="roll" axis="1 0 1" range="-3 3" frictionloss="0.3"/>
+          <geom type="box" size="0.1 0.05 0.2" pos="0.1 0 0.2" euler="0.3 0.2 0.1" mass="0.7"/>
+        </body>
+      </body>
+    </body>
+    <body name="ball" pos="2 0 1"><freejoint/><geom size="0.1"/></body>
+  </worldbody>
+  <actuator>
+    <motor joint="turn" ctrlrange="-20 20"/>
+    <motor joint="slide" gear="3" ctrlrange="-20 20"/>
+    <motor joint="lift" ctrlrange="-10 10"/>
+    <motor joint="roll" ctrlrange="-5 5"/>
+  </actuator>
+</mujoco>
+"""
+
+LIMITS = "joints: {default: {velocity: 2, acceleration: 10}, turn: {velocity: 1.5}}"
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Body:
+    (tmp_path / "arm.xml").write_text(ARM)
+    return Body.load(tmp_path / "arm.xml")
+
+
+@pytest.fixture
+def limits(arm: Body, tmp_path: Path) -> Limits:
+    (tmp_path / "limits.yaml").write_text(LIMITS)
+    return Limits.of(arm, tmp_path / "limits.yaml")
+
+
+def jaco() -> Body:
+    spec = importlib.util.find_spec("dm_control")
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip("needs dm_control")
+    folder = Path(spec.submodule_search_locations[0])
+    return Body.load(folder / "third_party" / "kinova" / "jaco_arm.xml")
+
+
+def random_motion(n: int, rows: int = 50) -> Motion:
+    rng = np.random.default_rng(3)
+    return Motion(0.01, *(size * rng.standard_normal((rows, n)) for size in (1.0, 2.0, 5.0)))
+
+
+def inverse(body: Body, motion: Motion, model: object = None) -> np.ndarray:
+    """Return the torques by the engine: passive forces of joints without damping and friction."""
+    model = model or body.model
+    data = mujoco.MjData(model)
+    flags = model.opt.disableflags
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    found = []
+    for q, v, a in zip(motion.positions, motion.velocities, motion.accelerations, strict=True):
+        data.qpos[:] = model.qpos0
+        data.qpos[body.addresses] = q
+        data.qvel[body.dofs], data.qacc[body.dofs] = v, a
+        mujoco.mj_inverse(model, data)
+        found.append(data.qfrc_inverse[body.dofs].copy())
+    model.opt.disableflags = flags
+    return np.array(found)
+
+
+def test_torques_are_those_of_the_engine(arm: Body) -> None:
+    for body in (arm, jaco()):
+        damping = body.model.dof_damping.copy()
+        motion = random_motion(body.n)
+        body.model.dof_damping[:] = 0.0
+        expected = inverse(body, motion)
+        body.model.dof_damping[:] = damping
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(body.torques(motion), expected, atol=1e-12 * scale)
+
+
+def test_a_free_body_is_no_joint_and_a_note_says_so(arm: Body) -> None:
+    assert arm.joints == ("turn", "slide", "lift", "roll")
+    assert arm.bodies == ("base", "link", "hand")
+    assert "1 joints that no actuator drives stay where the file puts them" in arm.notes
+
+
+@pytest.mark.parametrize("name", ["mass", "com", "inertia", "armature", "damping"])
+def test_regressors_are_derivatives_of_the_torques_of_the_engine(
+    arm: Body, limits: Limits, name: str
+) -> None:
+    unknowns = Unknowns(arm, limits, name)
+    motion = random_motion(arm.n, 10)
+    rows = unknowns.regressor(motion)
+    step = 1e-6
+    for i, one in enumerate(unknowns.parameters):
+        sides = []
+        for sign in (1.0, -1.0):
+            model = mujoco.MjModel.from_xml_string(ARM)
+            change = sign * step * one.scale
+            b = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, one.place)
+            if one.kind == "mass":
+                model.body_mass[b] += change
+            elif one.kind.startswith("com"):
+                model.body_ipos[b]["xyz".index(one.kind[-1])] += change
+            elif one.kind.startswith("I"):
+                model.body_inertia[b]["xyz".index(one.kind[-1])] += change
+            else:
+                dof = model.joint(one.place).dofadr[0]
+                getattr(model, f"dof_{one.kind}")[dof] += change
+            sides.append(inverse(arm, motion, model))
+        expected = (sides[0] - sides[1]) / (2.0 * step)
+        np.testing.assert_allclose(rows[:, :, i], expected, atol=1e-5 * max(1.0, np.ptp(expected)))
+
+
+def test_dry_friction_and_gear(arm: Body, limits: Limits) -> None:
+    motion = random_motion(arm.n)
+    unknowns = Unknowns(arm, limits, "frictionloss:roll,gear:lift")
+    dry, gear = np.moveaxis(unknowns.regressor(motion), 2, 0)
+    fast = np.abs(motion.velocities[:, 3]) > 0.1
+    np.testing.assert_allclose(dry[fast, 3], 0.3 * np.sign(motion.velocities[fast, 3]), rtol=1e-3)
+    total = arm.torques(motion)[:, 2] + 0.4 * motion.velocities[:, 2]
+    np.testing.assert_allclose(gear[:, 2], -total, rtol=1e-9)
+
+
+def test_null_directions_change_no_torque_and_are_complete(arm: Body, limits: Limits) -> None:
+    unknowns = Unknowns(arm, limits, "all")
+    motion = random_motion(arm.n, 400)
+    found = Identifiability.of(unknowns, motion, 500.0)
+    rows = unknowns.regressor(motion).reshape(-1, len(unknowns))
+    sizes = np.linalg.norm(rows, axis=0)
+    rows = rows[:, sizes > 1e-9 * sizes.max()]
+    rows /= np.linalg.norm(rows, axis=0)
+    rank = np.linalg.matrix_rank(rows, tol=1e-8 * np.linalg.norm(rows, 2))
+    assert len(found.null) == len(unknowns) - rank > 0
+
+
+def test_known_null_directions_in_words(tmp_path: Path) -> None:
+    """Of a single hinge under gravity: centre along the axis and two moments have no effect."""
+    (tmp_path / "one.xml").write_text(
+        """<mujoco><worldbody><body name="rod"><joint name="hinge" axis="0 1 0" range="-1 1"/>
+        <inertial pos="0.3 0 0" mass="2" diaginertia="0.1 0.2 0.3"/></body></worldbody></mujoco>"""
+    )
+    body = Body.load(tmp_path / "one.xml")
+    given = "joints: {hinge: {velocity: 2, acceleration: 9, torque: 10}}"
+    (tmp_path / "limits.yaml").write_text(given)
+    limits = Limits.of(body, tmp_path / "limits.yaml")
+    unknowns = Unknowns(body, limits, "mass,com,inertia,armature")
+    null = Identifiability.of(unknowns, random_motion(1, 200), 100.0).null
+    assert {text for text in null if "no effect" in text} == {
+        "com_y:rod has no effect",
+        "Ix:rod has no effect",
+        "Iz:rod has no effect",
+    }
+    pairs = [text for text in null if "no effect" not in text]
+    assert "Iy:rod − armature:hinge" in pairs
+    # m and c_x enter by m c_x and, with Iy, by the moment about the axis: one more.
+    assert len(null) == 5
+
+
+def test_errors_are_by_the_definition_and_scale_with_noise(arm: Body, limits: Limits) -> None:
+    motion = random_motion(arm.n)
+    exact, noisy = (
+        Unknowns(arm, limits, "damping,mass", noise=noise).information(motion, 100.0)
+        for noise in (0.01, 0.02)
+    )
+    np.testing.assert_allclose(exact, 4.0 * noisy, rtol=1e-12)
+    rows = Unknowns(arm, limits, "damping,mass").regressor(motion)
+    direct = sum(
+        row.T @ np.diag(1.0 / (0.01 * limits.torque) ** 2) @ row for row in rows
+    )  # one row each 10 ms is 100 Hz
+    np.testing.assert_allclose(exact, direct, rtol=1e-9)
+    expected = np.sqrt(np.diag(np.linalg.inv(direct + np.eye(len(direct)))))
+    np.testing.assert_allclose(relative_errors(exact), expected, rtol=1e-9)
+
+
+def test_limits_come_from_the_file_then_the_robot(limits: Limits) -> None:
+    np.testing.assert_array_equal(limits.velocity, [1.5, 2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(limits.torque, [20.0, 60.0, 10.0, 5.0])
+    np.testing.assert_allclose(limits.position[1], [-0.3, 0.3])
+
+
+def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
+    joints = "".join(
+        f"""<link name="l{i + 1}"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1"
+        izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j{i}" type="revolute">
+        <parent link="l{i}"/><child link="l{i + 1}"/><axis xyz="0 1 0"/><origin xyz="0 0 0.2"/>
+        <limit lower="-2" upper="2" effort="300" velocity="10"/></joint>"""
+        for i in range(3)
+    )
+    source = tmp_path / "robot.urdf"
+    source.write_text(f"""<robot name="r"><link name="l0"/>{joints}</robot>""")
+    limits = Limits.of(Body.load(source))
+    np.testing.assert_array_equal(limits.velocity, 10.0)
+    said = " ".join(limits.notes)
+    assert "every joint has the velocity 10 rad/s, which looks like a default" in said
+    assert "every joint has the torque 300 N m, which looks like a default" in said
+    assert "no acceleration is given" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("joints: {wrist: {velocity: 2}}", "joint 'wrist' is unknown"),
+        ("joints: {lift: {speed: 2}}", "limit of joint 'lift' 'speed' is unknown"),
+        ("joints: {lift: {velocity: fast}}", "lift.velocity in .* is 'fast', but a positive"),
+        ("joints: {lift: {position: [2, 1]}}", r"is \[2, 1\], but \[low, high\]"),
+        ("joints: {lift: 3}", "lift in .* is 3, but a mapping"),
+        ("[1, 2]", "has no mapping 'joints'"),
+        ("joints: {lift: [", "cannot be read"),
+        ("joints: {lift: {velocity: 2}}", "joint 'turn' has no limit of its velocity"),
+    ],
+)
+def test_limits_that_are_wrong_are_named(arm: Body, tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "limits.yaml").write_text(text)
+    with pytest.raises(SpecificationError, match=said):
+        Limits.of(arm, tmp_path / "limits.yaml")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "said"),
+    [
+        ("weight", "kind of parameter 'weight' is unknown"),
+        ("mass:foot", "body 'foot' is unknown"),
+        ("damping:base", "joint 'base' is unknown"),
+        ("", "no unknown parameter is given"),
+    ],
+)
+def test_parameters_that_are_wrong_are_named(
+    arm: Body, limits: Limits, wanted: str, said: str
+) -> None:
+    with pytest.raises(SpecificationError, match=said):
+        Unknowns(arm, limits, wanted)
+
+
+def test_files_that_are_no_robot_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "none.xml").write_text("<mujoco><worldbody/></mujoco>")
+    (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
+    for name, said in {
+        "none.xml": "no hinge or slide",
+        "bad.xml": "cannot be read",
+        "gone.xml": "gone.xml",
+    }.items():
+        with pytest.raises(SpecificationError, match=said):
+            Body.load(tmp_path / name)
+
+
+def test_collisions_are_found_and_contacts_at_home_are_not(tmp_path: Path) -> None:
+    source = tmp_path / "fold.xml"
+    source.write_text(
+        """<mujoco><worldbody><geom name="wall" type="plane" size="1 1 1"/>
+        <body name="arm" pos="0 0 0.5"><joint name="hinge" axis="0 1 0" range="-2 2"/>
+        <geom type="capsule" fromto="0 0 0 0.6 0 0" size="0.02"/></body></worldbody></mujoco>"""
+    )
+    body = Body.load(source)
+    touching = body.collisions(np.array([[0.0], [1.4], [-1.4]]))
+    assert touching == [(1, "world", "arm")]  # the axis turns it down

@@ -1,0 +1,189 @@
+"""Trajectories within limits, designs, the attainable information, and the files for others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dopt.errors import SpecificationError
+from dopt.robots.body import Body
+from dopt.robots.design import Design, Problem, attainable, multisine
+from dopt.robots.limits import Limits
+from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
+from tests.dopt.robots.test_body import arm, jaco, limits
+
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
+
+__all__ = ["arm", "limits"]  # fixtures
+
+
+def families(limits: Limits, seconds: float) -> list[Family]:
+    return [
+        Multisine(limits, seconds),
+        Fourier(limits, seconds, 2.0),
+        Fourier(limits, seconds, 5.0),
+        Ladder(limits, seconds),
+    ]
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seconds", [3.0, 10.0])
+def test_motions_keep_limits_begin_and_end_at_rest_and_are_integrals(
+    limits: Limits, seed: int, seconds: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    for family in families(limits, seconds):
+        motion = family.motion(2.0 * rng.standard_normal(family.size), 0.002)
+        shares = limits.shares(motion)
+        assert max(shares.values()) <= ROOM + 1e-9, (family.name, shares)
+        assert np.abs(motion.velocities[[0, -1]]).max() < 1e-9, family.name
+        mean = (motion.velocities[1:] + motion.velocities[:-1]) / 2.0
+        moved = motion.positions[0] + np.cumsum(mean, axis=0) * motion.dt
+        np.testing.assert_allclose(motion.positions[1:], moved, atol=2e-4, err_msg=family.name)
+        slopes = np.diff(motion.velocities, axis=0) / motion.dt
+        mean = (motion.accelerations[1:] + motion.accelerations[:-1]) / 2.0
+        off = np.abs(slopes - mean) / limits.acceleration
+        assert np.quantile(off, 0.9) < 0.01, family.name  # short ramps fall between two rows
+        assert (np.abs(slopes) <= limits.acceleration).all(), family.name
+
+
+def test_a_ladder_holds_constant_speeds(limits: Limits) -> None:
+    ladder = Ladder(limits, 10.0)
+    motion = ladder.motion(np.random.default_rng(0).standard_normal(ladder.size), 0.002)
+    still = np.abs(motion.accelerations) < 1e-9
+    fast = np.abs(motion.velocities) > 1e-9
+    assert (still & fast).mean() > 0.4
+
+
+def test_a_design_beats_multisines_and_no_motion_beats_the_bound(arm: Body, limits: Limits) -> None:
+    problem = Problem(arm, limits, "damping,frictionloss", 6.0)
+    design = Design.of(problem, effort=60)
+    reference = multisine(problem, np.random.default_rng(5))
+    assert design.best.score < reference.score
+    assert all(0.0 < one.share <= 1.0 for one in design.candidates)
+    assert np.log(design.best.errors / design.reference).mean() < np.log(0.9)
+    assert [one.score for one in design.candidates] == sorted(o.score for o in design.candidates)
+    # Random motions of other seeds stay below the bound, too.
+    bound, gap = attainable(problem, np.random.default_rng(9))
+    rng = np.random.default_rng(11)
+    for family in families(limits, 6.0):
+        one = problem.candidate(family, rng.standard_normal(family.size))
+        assert problem.determinant(problem.information(one.motion(0.04))) < bound
+    assert 0.0 <= gap < 0.5 * problem.count
+
+
+def test_the_bound_of_viscous_friction_alone_is_full_speed(arm: Body, limits: Limits) -> None:
+    """Each viscous constant is best known at the largest speed: the bound in closed form."""
+    problem = Problem(arm, limits, "damping", 5.0, nuisance="", noise=0.01, rate=100.0)
+    bound, gap = attainable(problem, np.random.default_rng(0))
+    steps = np.array([one.scale for one in problem.requested])
+    most = 500.0 * (steps * limits.velocity / (0.01 * limits.torque)) ** 2
+    exact = float(np.log1p(most).sum())
+    assert exact - 1e-6 < bound < exact + 0.3
+    assert gap < 0.3
+
+
+def test_torque_limits_shorten_motions(arm: Body, limits: Limits) -> None:
+    import dataclasses
+
+    weak = dataclasses.replace(limits, torque=limits.torque * np.array([0.03, 1.0, 1.0, 1.0]))
+    problem = Problem(arm, weak, "mass", 6.0)
+    family = Multisine(weak, 6.0)
+    one = problem.candidate(family, np.random.default_rng(1).standard_normal(family.size))
+    assert one.reach < 1.0
+    assert not one.free or problem.strain(one.motion(0.04)) <= 1.0 + 1e-9
+
+
+def test_designs_are_the_same_for_a_seed_and_differ_between_seeds(
+    arm: Body, limits: Limits
+) -> None:
+    first, again, other = (
+        Design.of(Problem(arm, limits, "damping", 3.0), seed=seed, effort=30) for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first.best.numbers, again.best.numbers)
+    assert first.best.score != other.best.score
+
+
+def test_expected_errors_are_reached_by_a_fit_to_simulated_torques() -> None:
+    """Least squares on torques with the declared noise: errors as expected, over 200 draws."""
+    body = jaco()
+    limits = Limits(
+        position=np.tile([-1.0, 1.0], (6, 1)),
+        velocity=np.full(6, 1.0),
+        acceleration=np.full(6, 5.0),
+        torque=np.full(6, 20.0),
+    )
+    problem = Problem(body, limits, "damping,frictionloss", 4.0, noise=1e-5, rate=100.0)
+    one = problem.candidate(
+        Ladder(limits, 4.0), np.random.default_rng(2).standard_normal(Ladder(limits, 4.0).size)
+    )
+    motion = one.motion(0.01)
+    rows = problem.unknowns.weighted(motion, 100.0).reshape(-1, len(problem.unknowns))
+    rng = np.random.default_rng(3)
+    found = np.linalg.lstsq(rows, rng.standard_normal((len(rows), 200)), rcond=None)[0]
+    ratio = found.std(axis=1) / problem.errors(problem.information(motion))
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.2
+
+
+@pytest.mark.parametrize("name", ["seconds", "noise", "rate"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_numbers_of_a_problem_are_positive(
+    arm: Body, limits: Limits, name: str, value: float
+) -> None:
+    with pytest.raises(SpecificationError, match=f"{name} of a design is .* but a positive"):
+        Problem(arm, limits, "damping", **({"seconds": 5.0} | {name: value}))
+
+
+def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
+    from mujoco import sysid
+
+    from dopt.robots.sysid import sequences
+
+    text = """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
+      <joint name="a" axis="0 1 0" damping="0.8"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
+      <body pos="0.3 0 0"><joint name="b" axis="0 1 0" damping="0.3"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" contype="0" conaffinity="0"/>
+      </body></body></worldbody></mujoco>"""
+    source = tmp_path / "two.xml"
+    source.write_text(text)
+    body = Body.load(source)
+    data = mujoco.MjData(body.model)
+    times = 0.002 * np.arange(700)
+    torques = np.stack([4.0 * np.sin(3.0 * times), 2.0 * np.sin(5.0 * times)], axis=1)
+    positions = []
+    for row in torques:
+        positions.append(data.qpos.copy())
+        data.qfrc_applied[:] = row
+        mujoco.mj_step(body.model, data)
+    q = np.array(positions)
+    log = pd.DataFrame(
+        {"time": 5.0 + times, "q_a": q[:, 0], "q_b": q[:, 1]}
+        | {"tau_a": torques[:, 0], "tau_b": torques[:, 1]}
+    )
+    found = sequences(body, log)
+    parameters = sysid.ParameterDict()
+    for joint in body.joints:
+
+        def change(spec: object, one: object, joint: str = joint) -> None:
+            value = float(np.ravel(one.value)[0])  # type: ignore[attr-defined]  # of a library
+            spec.joint(joint).damping = [value, 0.0, 0.0]  # type: ignore[attr-defined]
+
+        parameters.add(
+            sysid.Parameter(joint, nominal=0.5, min_value=0.01, max_value=5.0, modifier=change)
+        )
+    residual = sysid.build_residual_fn(models_sequences=[found])
+    fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False)
+    assert fitted["a"].value == pytest.approx(0.8, rel=0.02)
+    assert fitted["b"].value == pytest.approx(0.3, rel=0.02)
+    for broken, said in (
+        (log.drop(columns="q_a"), "no column 'q_a'"),
+        (log.assign(tau_b=np.nan), "not finite"),
+        (log.assign(time=log.time**2), "not evenly spaced"),
+    ):
+        with pytest.raises(SpecificationError, match=said):
+            sequences(body, broken)
