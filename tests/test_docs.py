@@ -22,6 +22,7 @@ from orchestrate import __main__ as orchestrate
 from orchestrate import launch
 from orchestrate.commands import COMMANDS
 from tests.analysis.synthetic import fill, make_grid
+from tests.orchestrate.commands.test_design import LIMITS, ROBOT
 from tests.pages import GENERATED, PAGES, Command, blocks, commands
 from tests.paths import EXAMPLE, ROOT
 from tests.typed_commands import empty_folder, run_typed
@@ -200,6 +201,11 @@ def test_every_command_on_results_works(
     (tmp_path / "results" / "shards").mkdir()
     shutil.copy(tmp_path / "results" / "other.db", tmp_path / "results" / "shards")
     words = tuple("SELECT 1 AS one" if word == "SELECT ..." else word for word in command.words)
+    if command.words[0] == "design":
+        pytest.importorskip("mujoco", reason="needs MuJoCo")
+        (tmp_path / "arm.xml").write_text(ROBOT.replace("upper", "link7").replace("lower", "hand"))
+        (tmp_path / "limits.yaml").write_text(LIMITS)
+        words += () if "--check" in words else ("--effort", "24", "--seconds", "2")
     assert typed(Command(command.page, {}, "orchestrate", words))
 
 

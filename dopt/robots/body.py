@@ -111,6 +111,10 @@ class Body:
             If MuJoCo is not installed, or the file cannot be read or describes no arm.
         """
         source = given_path(str(file), "the file of a robot", SpecificationError)
+        if not source.is_file():
+            raise SpecificationError(
+                f"there is no file {source}, but a robot in MJCF or URDF is expected: correct it."
+            )
         try:
             import mujoco
         except ModuleNotFoundError as error:
