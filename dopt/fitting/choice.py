@@ -77,7 +77,7 @@ class Choice:
         Places in the pool, or among its segments; without ``taken``.
     gains, shares : (k,) arrays
         What each raised log det by, at what was known when it was taken; information of all taken
-        so far by that of the whole pool, as differences of log det.
+        so far by the information of the whole pool, as differences of log det.
     logs : tuple of Log
         What was chosen, for :func:`dopt.fit`; empty for signals.
     places : tuple of str

@@ -47,7 +47,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--limits",
         type=path("--limits"),
         metavar="YAML",
-        help="position, velocity, acceleration and torque of each joint (those of ROBOT)",
+        help="position, velocity, acceleration and torque of each joint (as in ROBOT)",
     )
     parser.add_argument("--check", action="store_true", help="say only what is identifiable")
     parser.add_argument(
