@@ -392,7 +392,8 @@ class RobotExplorer:
 
         Torques turn joints round within windows, which then fit badly: they are not compared.
         """
-        few = len(self._recent) < RECENT or self.counts["windows"] < 3 * RECENT
+        self._since += 1
+        few = len(self._recent) < RECENT or self._since < 3 * RECENT
         if few or self.inputs == "torques":
             return False
         recent = np.array(self._recent)
