@@ -239,11 +239,11 @@ ONE_FIT: dict[str, Any] = {"noise": "fitted", "refit_every": 60, "horizon": 60}
 
 
 def test_it_is_the_likeliest_of_its_neighbours() -> None:
-    fast = KernelTrial(sensed("pendulum", ANGLE, **ONE_FIT, noise_variance=30.0))
+    fast = KernelTrial(sensed("pendulum", ANGLE, **ONE_FIT, noise_variance=3.0))
     fast.advance(60)
     noise, none = fast.state.estimate.noise_variance, np.empty((0, len(fast.state.theta)))
     fitted, lowest = float(noise[0]), call(run_filter, fast.trial, 60, none, np.empty(0))
-    moves = abs(math.log10(fitted / 30.0)) / math.log10(NOISE_FACTORS[0])
+    moves = abs(math.log10(fitted / 3.0)) / math.log10(NOISE_FACTORS[0])
     assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
     for factor in NOISE_FACTORS:
         noise[0] = factor * fitted
