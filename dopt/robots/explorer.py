@@ -155,6 +155,7 @@ class RobotExplorer:
         self._rows: list[tuple[Array, ...]] = []
         self._recent: deque[Array] = deque(maxlen=RECENT)
         self._payload: list[tuple[Any, ...]] | None = None
+        self._since = 0  # windows since the body was last known to change
         self._done = False
         self._due: float | None = None
         self._alarm = float(chi2.isf(FALSE_ALARM, n))
@@ -391,7 +392,8 @@ class RobotExplorer:
 
         Torques turn joints round within windows, which then fit badly: they are not compared.
         """
-        few = len(self._recent) < RECENT or self.counts["windows"] < 3 * RECENT
+        self._since += 1
+        few = len(self._recent) < RECENT or self._since < 3 * RECENT
         if few or self.inputs == "torques":
             return False
         recent = np.array(self._recent)
@@ -419,7 +421,7 @@ class RobotExplorer:
         learner.forget(10.0)
         self._say(f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3)} kg m")
         self._recent.clear()
-        self._payload = None
+        self._payload, self._since = None, 0
 
     def _say(self, text: str) -> None:
         self.warnings.append(text)

@@ -12,7 +12,7 @@ from analysis.stats.intervals import Estimate, geometric_mean
 from analysis.style import number, share, within
 from studies.conclusions.filter import PARTS
 from studies.conclusions.network import FORMS
-from studies.conclusions.trials import BEST, LEARNERS, PLANTS, SYSTEMS
+from studies.conclusions.trials import BEST, LEARNERS, PLANTS, SYSTEMS, explored
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROWS, NETWORK = DOCS / "conclusions.csv", DOCS / "network.csv"
@@ -140,15 +140,17 @@ def conclusions_states(rows: pd.DataFrame | None = None) -> str:
 
 
 def conclusions_plants(rows: pd.DataFrame | None = None) -> str:
-    """Loss over the loss of D-optimal inputs, the pendulum behind hardware."""
+    """Loss over the loss of D-optimal inputs, the pendulum behind hardware and the fitted disk."""
     rows = read() if rows is None else rows
     body = []
     for learner in LEARNERS:
-        cells = [mean_text(losses(rows, "pendulum", one, "d_optimal", learner)) for one in PLANTS]
+        cells = [
+            mean_text(losses(rows, explored(one), one, "d_optimal", learner)) for one in PLANTS
+        ]
         body.append([f"D-optimal, `{learner}`: loss", *cells])
         for policy in RIVALS:
             pairs = (
-                (losses(rows, "pendulum", one, name, learner) for name in (policy, "d_optimal"))
+                (losses(rows, explored(one), one, name, learner) for name in (policy, "d_optimal"))
                 for one in PLANTS
             )
             body.append([f"{policy}, `{learner}`", *(ratio_text(*pair) for pair in pairs)])

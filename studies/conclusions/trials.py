@@ -16,6 +16,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.properties import eigenmode
 from dopt.types import Array
+from studies.conclusions.disk import DELAY, Disk
 
 STEPS = 500
 SYSTEMS = ("pendulum", "cartpole", "arm", "quadrotor")
@@ -32,8 +33,9 @@ PLANTS: dict[str, dict[str, Any]] = {
     "delay": {"delay": 1.0},
     "encoder": {"counts": 2048.0},
     "friction": {"coulomb": 0.5},
+    "disk": {"delay": DELAY / Disk.dt},
 }
-"""Hardware around the pendulum: a late sample, counts a turn, dry friction [1/s²]."""
+"""Hardware around the pendulum, or the disk: late samples, counts a turn, dry friction [1/s²]."""
 
 WITHIN = 0.25
 """Part of the eigenfrequency by which an input may differ from it."""
@@ -50,7 +52,7 @@ class Cell(NamedTuple):
     def spec(self, seed: int) -> TrialSpec:
         """Return one trial."""
         sections: dict[str, Any] = {
-            "env": {"name": self.env, "horizon": STEPS},
+            "env": {"horizon": STEPS} | system_of(self.env),
             "policy": {"name": self.policy},
             "seed": seed,
         }
@@ -58,6 +60,8 @@ class Cell(NamedTuple):
             sections["policy"] = BEST[self.env]
         elif self.policy == "d_optimal" and self.learner == "evidence":
             sections["policy"] = {"name": "exact"}
+        elif self.policy == "periodic" and self.env == Disk.name:  # whose friction hides its mode
+            sections["policy"]["frequency"] = math.sqrt(Disk.gravity)
         if self.policy == "oracle":
             sections |= {
                 "model": {"name": "linear"},
@@ -72,6 +76,16 @@ class Cell(NamedTuple):
             if self.learner == "evidence":
                 sections["model"] = {**EVIDENCE, "noise": "fitted"}
         return TrialSpec.from_mapping(sections)
+
+
+def system_of(env: str) -> dict[str, Any]:
+    """Return what names a system in a specification."""
+    return {"_target_": f"{Disk.__module__}.Disk"} if env == Disk.name else {"name": env}
+
+
+def explored(plant: str) -> str:
+    """Return the system that hardware stands around."""
+    return Disk.name if plant == Disk.name else "pendulum"
 
 
 BOX: dict[str, Any] = {"name": "episodic", "criterion": "variance", "domain": "box"}
@@ -99,7 +113,7 @@ def cells() -> list[list[Cell]]:
     first = [Cell(env, "ideal", "best", "evidence") for env in BEST]
     first.append(Cell("pendulum", "ideal", "oracle", "least_squares"))
     hardware = [
-        Cell("pendulum", plant, one, name)
+        Cell(explored(plant), plant, one, name)
         for plant in PLANTS
         for one in policies["pendulum"]
         for name in LEARNERS
