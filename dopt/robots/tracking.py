@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 
 from dopt.robots.body import Body
@@ -26,7 +25,9 @@ class KnownBody:
     """
 
     def __init__(self, body: Body) -> None:
-        self.body, self.model = body, copy.copy(body.model)
+        import mujoco
+
+        self.body, self.model, self._engine = body, copy.copy(body.model), mujoco
         self.model.opt.disableflags |= (
             mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
         )
@@ -41,7 +42,7 @@ class KnownBody:
         data.qpos[self.body.addresses] = q
         data.qvel[dofs] = v
         data.qacc[dofs] = a
-        mujoco.mj_inverse(self.model, data)
+        self._engine.mj_inverse(self.model, data)
         return np.array(data.qfrc_inverse[dofs])
 
     def mass_matrix(self) -> Array:
@@ -50,7 +51,7 @@ class KnownBody:
         M = np.empty((len(dofs), len(dofs)))
         for k, dof in enumerate(dofs):
             self._unit[dof] = 1.0
-            mujoco.mj_mulM(self.model, self._data, self._column, self._unit)
+            self._engine.mj_mulM(self.model, self._data, self._column, self._unit)
             self._unit[dof] = 0.0
             M[k] = self._column[dofs]
         return M
@@ -65,7 +66,7 @@ class KnownBody:
         if mass > 0.0:
             away = moment / mass - centre
             model.body_inertia[last] += own * mass / total * (away @ away)
-        mujoco.mj_setConst(model, self._data)
+        self._engine.mj_setConst(model, self._data)
 
 
 class Tracker:

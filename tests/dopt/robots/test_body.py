@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -277,3 +279,19 @@ def test_collisions_are_found_and_contacts_at_home_are_not(tmp_path: Path) -> No
     body = Body.load(source)
     touching = body.collisions(np.array([[0.0], [1.4], [-1.4]]))
     assert touching == [(1, "world", "arm")]  # the axis turns it down
+
+
+def test_without_mujoco_one_sentence_says_what_to_install(arm: Body) -> None:
+    assert arm.source is not None
+    text = f"""
+import sys
+sys.modules["mujoco"] = None
+from dopt.errors import SpecificationError
+from dopt.robots import Body, RobotExplorer
+try:
+    Body.load({str(arm.source)!r})
+except SpecificationError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout
