@@ -8,19 +8,17 @@ linear ones: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 from __future__ import annotations
 
 import dataclasses
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dopt.errors import SpecificationError, given_path, install_command
+from dopt.systems.mujoco import log_warnings
 from dopt.types import Array
 
 if TYPE_CHECKING:
     import mujoco
-
-_log = logging.getLogger(__name__)
 
 INERTIAL = 10
 """Inertial parameters of a body: m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about its origin."""
@@ -84,7 +82,7 @@ class Body:
     def __init__(self, model: mujoco.MjModel, source: Path | None = None) -> None:
         import mujoco
 
-        _log_warnings()
+        log_warnings()
         self.model, self.source = model, source
         self._ids = _driven_joints(model)
         if not self._ids:
@@ -155,7 +153,7 @@ class Body:
     def _inertial_of(self, b: int) -> Array:
         model = self.model
         m, c = float(model.body_mass[b]), np.array(model.body_ipos[b])
-        axes = _rotation(model.body_iquat[b])
+        axes = rotation(model.body_iquat[b])
         about_com = axes @ np.diag(model.body_inertia[b]) @ axes.T
         return inertial_row(m, m * c, about_com + m * (c @ c * np.eye(3) - np.outer(c, c)))
 
@@ -195,7 +193,7 @@ class Body:
         for b in range(1, model.nbody):
             turn, origin, velocity, acceleration, jacobian = frames[int(model.body_parentid[b])]
             origin = origin + turn @ model.body_pos[b]
-            turn = turn @ _rotation(model.body_quat[b])
+            turn = turn @ rotation(model.body_quat[b])
             first = int(model.body_jntadr[b])
             for j in range(first, first + int(model.body_jntnum[b])):
                 if j not in own:
@@ -348,19 +346,12 @@ def _turns(axis: Array, angles: Array) -> Array:
     return result
 
 
-def _rotation(quaternion: Array) -> Array:
+def rotation(quaternion: Array) -> Array:
+    """Return the rotation of a unit quaternion (w, x, y, z), (3, 3)."""
     w, v = quaternion[0], quaternion[1:]
     k = _skew(v[None])[0]
     result: Array = np.eye(3) + 2.0 * (w * k + k @ k)
     return result
-
-
-def _log_warnings() -> None:
-    """Have the engine's warnings logged: it would write a file into the working folder."""
-    import mujoco
-
-    if mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(lambda text: _log.info("MuJoCo warns: %s", text))
 
 
 def _driven_joints(model: mujoco.MjModel) -> list[int]:
@@ -413,4 +404,4 @@ def without_meshes(source: Path) -> mujoco.MjSpec:
     return spec
 
 
-__all__ = ["INERTIAL", "Body", "Motion", "inertial_row", "without_meshes"]
+__all__ = ["INERTIAL", "Body", "Motion", "inertial_row", "rotation", "without_meshes"]

@@ -16,12 +16,12 @@ from typing import Self
 
 import numpy as np
 
-from dopt.arguments import whole
+from dopt.arguments import whole, within
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
 from dopt.robots.limits import Limits
-from dopt.robots.parameters import Identifiability, Parameter, Unknowns, relative_errors
-from dopt.robots.trajectories import Family, Fourier, Ladder, Multisine
+from dopt.robots.parameters import Identifiability, Parameter, Unknowns, count_null, relative_errors
+from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
 from dopt.types import Array
 
 COARSE = 0.04
@@ -46,7 +46,7 @@ FLOOR = 3.0
 """Weight of the logarithm by which the worst error exceeds its reference."""
 
 FRICTION = "damping,frictionloss"
-"""What is unknown beside the requested parameters unless told otherwise."""
+"""Unknown parameters beside the requested ones unless told otherwise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,24 +61,32 @@ class Candidate:
         What :meth:`Family.motion` makes it of.
     reach : float
         Share of its amplitude, for torques and collisions.
-    score : float
-        Mean logarithm of the relative errors, by D_s, and the penalty: lower is better.
+    determinant : float
+        log det of the information about the requested parameters.
     errors : (p,)
         Standard errors of the requested parameters, relative.
+    broken : float
+        By how much it breaks the limits of torque or lets bodies touch; 0 if it does neither.
+    score : float
+        Mean logarithm of the relative errors, by D_s, and the penalties: lower is better.
     share : float
-        Share of the attainable information about them, for each of them.
-    free : bool
-        Whether it keeps the limits of torque and no bodies touch.
+        Share of the attainable information about them, for each of them; 0 until it is known.
     """
 
     name: str
     family: Family
     numbers: Array
     reach: float
-    score: float
+    determinant: float
     errors: Array
-    share: float
-    free: bool
+    broken: float
+    score: float
+    share: float = 0.0
+
+    @property
+    def free(self) -> bool:
+        """Whether it keeps the limits of torque and no bodies touch."""
+        return self.broken == 0.0
 
     def motion(self, dt: float) -> Motion:
         """Return the motion with rows dt apart [s]."""
@@ -115,13 +123,10 @@ class Problem:
         noise: float = 0.01,
         rate: float = 500.0,
     ) -> None:
-        for what, number in (("seconds", seconds), ("noise", noise), ("rate", rate)):
-            if not number > 0 or not math.isfinite(number):
-                raise SpecificationError(
-                    f"{what} of a design is {number!r}, but a positive number is expected: "
-                    f"correct it."
-                )
-        self.body, self.limits, self.seconds, self.rate = body, limits, seconds, rate
+        self.body, self.limits = body, limits
+        self.seconds = within("seconds of a design", seconds, math.inf)
+        self.rate = within("rate of a design", rate, math.inf)
+        noise = within("noise of a design", noise, math.inf)
         asked = Unknowns(body, limits, wanted, noise)
         beside = [one for one in nuisance.split(",") if one]
         self.unknowns = Unknowns(body, limits, [*asked.names, *beside], noise)
@@ -147,10 +152,10 @@ class Problem:
         """Return the relative standard errors of the requested parameters, (p,)."""
         return relative_errors(information)[: self.count]
 
-    def score(self, information: Array) -> float:
-        """Return the criterion: lower is better."""
-        worst = math.log(float(np.max(self.errors(information) / self.reference)) / ABOVE)
-        return -0.5 * self.determinant(information) / self.count + FLOOR * max(worst, 0.0)
+    def score(self, determinant: float, errors: Array, broken: float) -> float:
+        """Return the criterion of a :class:`Candidate`: lower is better."""
+        worst = math.log(float(np.max(errors / self.reference)) / ABOVE)
+        return -0.5 * determinant / self.count + FLOOR * max(worst, 0.0) + 10.0 * broken
 
     def strain(self, motion: Motion, rigid: Array | None = None) -> float:
         """Return the largest share of the limits of torque, friction included."""
@@ -168,16 +173,22 @@ class Problem:
             motion = family.motion(numbers, COARSE, reach)
             rigid = self.body.regressor(motion)
             strain = self.strain(motion, rigid)
-            if strain <= 1.0:
+            if strain <= ROOM:  # between these rows it may be larger
                 break
-            reach *= max(0.6, 0.98 / math.sqrt(strain))
-        looked = motion.positions[:: round(0.2 / COARSE)]
+            reach *= max(0.6, 0.98 * math.sqrt(ROOM / strain))
+        looked = motion.positions[::3]
         touching = {row for row, _, _ in self.body.collisions(looked)}
-        broken = max(strain - 1.0, 0.0)
+        broken = max(strain - ROOM, 0.0)
         broken += 0.5 + len(touching) / len(looked) if touching else 0.0
         information = self.unknowns.information(motion, self.rate, rigid)
-        score, errors = self.score(information) + 10.0 * broken, self.errors(information)
-        return Candidate(family.name, family, numbers, reach, score, errors, 0.0, broken == 0.0)
+        found = self.determinant(information), self.errors(information), broken
+        return Candidate(family.name, family, numbers, reach, *found, self.score(*found))
+
+    def checked(self, one: Candidate) -> Candidate:
+        """Return a candidate, broken if torques are too large or bodies touch at finer steps."""
+        motion = one.motion(FINE)
+        broken = self.strain(motion) > 1.0 or bool(self.body.collisions(motion.positions))
+        return dataclasses.replace(one, broken=1.0) if broken else one
 
 
 def _friction(body: Body, limits: Limits) -> Array:
@@ -250,9 +261,11 @@ class Design:
         rng = np.random.default_rng(seed)
         found = list(_candidates(problem, rng, effort, progress))
         bound, gap = attainable(problem, rng)
-        identified = problem.count - len(_null(problem, found[0]))
+        null = count_null(problem.unknowns, found[0].motion(COARSE))
+        identified = max(problem.count - null, 1)
         shared = [
-            dataclasses.replace(one, share=_share(problem, one, bound, identified)) for one in found
+            dataclasses.replace(one, share=math.exp((one.determinant - bound) / identified))
+            for one in map(problem.checked, found)
         ]
         shared.sort(key=lambda one: (not one.free, one.score))
         if not shared[0].free:
@@ -261,22 +274,7 @@ class Design:
                 "smaller ranges of position around a pose in which the robot is free, or larger "
                 "torques."
             )
-        return cls(problem, tuple(shared), problem.reference, gap / max(identified, 1))
-
-
-def _is_free(problem: Problem, one: Candidate) -> bool:
-    """Return True if a motion keeps the torques and no bodies touch, by finer steps."""
-    motion = one.motion(FINE)
-    return problem.strain(motion) <= 1.0 and not problem.body.collisions(motion.positions)
-
-
-def _null(problem: Problem, one: Candidate) -> list[str]:
-    return Identifiability.of(problem.unknowns, one.motion(COARSE), problem.rate).null
-
-
-def _share(problem: Problem, one: Candidate, bound: float, identified: int) -> float:
-    reached = problem.determinant(problem.information(one.motion(COARSE)))
-    return math.exp((reached - bound) / max(identified, 1))
+        return cls(problem, tuple(shared), problem.reference, gap / identified)
 
 
 def _candidates(
@@ -287,7 +285,7 @@ def _candidates(
     best = multisine(problem, rng)
     progress(f"multisine, best of {REFERENCES}: {_said(best)}")
     yield best
-    periods = [period for period in PERIODS if period < seconds] or [seconds]
+    periods = [period for period in PERIODS if period < seconds]
     tried = [
         [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(BEGUN)]
         for family in (Fourier(limits, seconds, period) for period in [*periods, seconds])
@@ -306,7 +304,12 @@ def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
     problem.reference = np.ones(problem.count)
     drawn = [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(REFERENCES)]
     problem.reference = np.median([one.errors for one in drawn], axis=0)
-    return min((problem.candidate(family, one.numbers) for one in drawn), key=lambda one: one.score)
+    found = (dataclasses.replace(one, score=problem.score(*_judged(one))) for one in drawn)
+    return min(found, key=lambda one: one.score)
+
+
+def _judged(one: Candidate) -> tuple[float, Array, float]:
+    return one.determinant, one.errors, one.broken
 
 
 def _said(one: Candidate) -> str:

@@ -6,13 +6,12 @@ import logging
 import math
 import time as clock
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from dopt import arguments
@@ -22,6 +21,7 @@ from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
 from dopt.robots.windows import window_size
+from dopt.sphere import sphere_maximizer
 from dopt.types import Array
 
 LEVELS = np.array([0.022, 0.035, 0.06, 0.12, 0.25, 0.5, 0.93])
@@ -159,6 +159,9 @@ class RobotExplorer:
         self._done = False
         self._due: float | None = None
         self._alarm = float(chi2.isf(FALSE_ALARM, n))
+        if inputs == "torques":
+            self._tie = np.random.default_rng(seed).standard_normal(n)
+            self._maximize = _compiled_maximizer(n)
 
     @property
     def done(self) -> bool:
@@ -345,7 +348,7 @@ class RobotExplorer:
         D = self.dt * inverse * limits.torque
         Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)
         v = -D.T @ (J * weighed).sum(axis=1)
-        chosen = _on_sphere(Q, v, self._gamma)
+        chosen = self._maximize(Q, v, self._gamma, self._tie)
         a = idle + inverse @ (chosen * limits.torque)
         after = tracker.v + self.dt * a
         rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
@@ -460,25 +463,18 @@ class RobotExplorer:
         return done | {"counts": dict(self.counts), "warnings": list(self.warnings)}
 
 
-def _on_sphere(Q: Array, v: Array, radius: float) -> Array:
-    """Return the maximiser of uᵀQu - 2vᵀu on ‖u‖ = radius, faster than :mod:`dopt.sphere` in numpy.
+def _on_sphere(Q: Array, v: Array, radius: float, tie: Array) -> Array:
+    return sphere_maximizer(Q, v, radius, tie)
 
-    The eigenvalues of Q and the root of the secular equation; a linear term along the top
-    eigenvector is never quite 0, which leaves the hard case out.
-    """
-    values, axes = np.linalg.eigh(Q)
-    w, gaps = axes.T @ v, values[-1] - values
-    size = max(float(np.linalg.norm(w)), float(gaps[0]) * radius, 1e-300)
-    w, gaps = w / size, gaps / size
-    w[-1] = w[-1] if abs(w[-1]) > 1e-9 else 1e-9
-    low, high = abs(w[-1]) / radius, float(np.linalg.norm(w)) / radius
-    tau = low
-    if high > low * (1.0 + 1e-12):
-        pairs = list(zip(w.tolist(), gaps.tolist(), strict=True))
-        tau = brentq(lambda t: sum((x / (d + t)) ** 2 for x, d in pairs) - radius**2, low, high)
-    u = axes @ (-w / (gaps + tau))
-    result: Array = u * (radius / np.linalg.norm(u))
-    return result
+
+def _compiled_maximizer(n: int) -> Callable[..., Array]:
+    """Return the maximiser of :mod:`dopt.sphere`, compiled before the first period of control."""
+    import dopt.kernel.policies  # noqa: F401  # it lets the maximiser compile
+    from dopt.kernel.compiler import called_from_python  # Numba: references do without
+
+    maximize = called_from_python(_on_sphere)
+    maximize(np.eye(n), np.ones(n), 1.0, np.ones(n))
+    return maximize
 
 
 def _mean_features(start: Array, end: Array) -> Array:

@@ -16,7 +16,7 @@ from dopt.robots.body import Body, Motion
 from dopt.types import Array
 
 KINDS = ("position", "velocity", "acceleration", "torque")
-"""What is limited, in rad or m, per s, per s², and N m or N."""
+"""Kinds of limits, in rad or m, per s, per s², and N m or N."""
 
 STOPPING = 0.2
 """Seconds from the largest velocity to rest: the acceleration where none is given."""
@@ -95,17 +95,20 @@ class Limits:
         result: Array = self.position.mean(axis=1)
         return result
 
-    def shares(self, motion: Motion, torques: Array | None = None) -> dict[str, float]:
-        """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
+    def parts(self, motion: Motion, torques: Array | None = None) -> dict[str, Array]:
+        """Return a motion as parts of each kind of limit, (T, n); 1 and -1 are the limits."""
         half = np.diff(self.position, axis=1)[:, 0] / 2.0
-        taken = {
+        parts = {
             "position": (motion.positions - self.middle) / half,
             "velocity": motion.velocities / self.velocity,
             "acceleration": motion.accelerations / self.acceleration,
         }
-        if torques is not None:
-            taken["torque"] = torques / self.torque
-        return {kind: float(np.abs(share).max()) for kind, share in taken.items()}
+        return parts if torques is None else parts | {"torque": torques / self.torque}
+
+    def shares(self, motion: Motion, torques: Array | None = None) -> dict[str, float]:
+        """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
+        parts = self.parts(motion, torques)
+        return {kind: float(np.abs(part).max()) for kind, part in parts.items()}
 
 
 def _own(body: Body) -> dict[str, list[Any]]:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.optimize
 
 from dopt.errors import SpecificationError, unknown_name
-from dopt.robots.body import INERTIAL, Body, Motion, _rotation, inertial_row
+from dopt.robots.body import INERTIAL, Body, Motion, inertial_row, rotation
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -251,7 +251,7 @@ class Unknowns:
                 about = 2.0 * c[axis] * np.eye(3) - np.outer(unit, c) - np.outer(c, unit)
                 change = inertial_row(0.0, mass * unit, mass * about)
             else:
-                axes = _rotation(model.body_iquat[b])
+                axes = rotation(model.body_iquat[b])
                 change = inertial_row(0.0, np.zeros(3), np.outer(axes[:, axis], axes[:, axis]))
             result[INERTIAL * which : INERTIAL * (which + 1), i] = change
         return result
@@ -300,16 +300,9 @@ class Identifiability:
     def of(cls, unknowns: Unknowns, motion: Motion, rate: float) -> Identifiability:
         """Examine a motion, of which each torque is measured at a rate [Hz]."""
         rows = unknowns.weighted(motion, rate).reshape(-1, len(unknowns))
-        sizes = np.linalg.norm(rows, axis=0)
-        dead = sizes <= NULL * sizes.max()  # of columns that rounding alone fills
-        sizes[dead] = np.inf
-        _, values, vectors = np.linalg.svd(np.linalg.qr(rows / sizes, mode="r"))
-        sizes[dead] = 1.0
-        lost = values <= NULL * values[0]
-        null = vectors[lost] / sizes
-        basis = _sparse(null / np.abs(null).max(axis=1, keepdims=True))
+        null, alone = _null_space(rows)
+        basis = _sparse(null)
         touched = np.abs(basis).max(axis=0, initial=0.0) > SMALL
-        alone = np.linalg.norm(vectors[~lost].T / values[~lost], axis=1) / sizes
         weak = [
             f"{one.name} ({100.0 * error:.0f} %)"
             for one, error, is_null in zip(unknowns.parameters, alone, touched, strict=True)
@@ -317,6 +310,27 @@ class Identifiability:
         ]
         errors = relative_errors(rows.T @ rows)
         return cls(unknowns.names, errors, [_words(row, unknowns) for row in basis], weak)
+
+
+def count_null(unknowns: Unknowns, motion: Motion) -> int:
+    """Return how many combinations of the parameters a motion does not change."""
+    return len(_null_space(unknowns.weighted(motion, 1.0).reshape(-1, len(unknowns)))[0])
+
+
+def _null_space(rows: Array) -> tuple[Array, Array]:
+    """Return the combinations that rows (N, p) do not see, (k, p), and errors of the rest, (p,).
+
+    Columns have one size while the rank is decided, and the largest part of a combination is 1.
+    """
+    sizes = np.linalg.norm(rows, axis=0)
+    dead = sizes <= NULL * sizes.max()  # of columns that rounding alone fills
+    sizes[dead] = np.inf
+    _, values, vectors = np.linalg.svd(np.linalg.qr(rows / sizes, mode="r"))
+    sizes[dead] = 1.0
+    lost = values <= NULL * values[0]
+    null = vectors[lost] / sizes
+    alone = np.linalg.norm(vectors[~lost].T / values[~lost], axis=1) / sizes
+    return null / np.abs(null).max(axis=1, keepdims=True), alone
 
 
 def relative_errors(information: Array) -> Array:
@@ -382,4 +396,4 @@ def _times(factor: float) -> str:
     return sign if text == "1" else f"{sign}{text} · "
 
 
-__all__ = ["Identifiability", "Parameter", "Unknowns", "relative_errors"]
+__all__ = ["Identifiability", "Parameter", "Unknowns", "count_null", "relative_errors"]

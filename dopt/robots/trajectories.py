@@ -194,7 +194,7 @@ class Ladder(Family):
         for k in range(self.n):
             low, high = self.limits.position[k]
             middle, half = (low + high) / 2.0, reach * ROOM * (high - low) / 2.0
-            path = Path1(
+            path = JointPath(
                 float(centres[k]),
                 (middle - half, middle + half),
                 ROOM * self.limits.acceleration[k],
@@ -208,7 +208,7 @@ class Ladder(Family):
         return Motion(dt, q, v, a)
 
 
-class Path1:
+class JointPath:
     """Path of one joint at constant speeds, between ramps without jumps of the acceleration.
 
     Parameters
@@ -309,4 +309,4 @@ def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
     return w, sign * slope, bend / ramp**2
 
 
-__all__ = ["Family", "Fourier", "Ladder", "Multisine", "Path1"]
+__all__ = ["Family", "Fourier", "JointPath", "Ladder", "Multisine"]

@@ -152,7 +152,7 @@ def _checked_model(system: MuJoCo) -> mujoco.MjModel:
     """Return the model of a system, or raise SpecificationError if it is not as declared."""
     try:
         model = type(system).load()
-        _log_warnings()
+        log_warnings()
     except ModuleNotFoundError as error:
         raise SpecificationError(f"env '{system.name}' {MISSING}") from error
     n, name = system.n_states // 2, system.name
@@ -168,7 +168,7 @@ def _checked_model(system: MuJoCo) -> mujoco.MjModel:
     return model
 
 
-def _log_warnings() -> None:
+def log_warnings() -> None:
     """Have the engine's warnings logged: it would write a file into the working folder."""
     import mujoco
 
@@ -385,4 +385,11 @@ class MuJoCoReacher(SuiteModel):
         return 10.0 * state[2], 10.0 * state[3], 0.0 * state[2], 0.0 * state[3]
 
 
-__all__ = ["MuJoCo", "MuJoCoAcrobot", "MuJoCoCartpole", "MuJoCoPendulum", "MuJoCoReacher"]
+__all__ = [
+    "MuJoCo",
+    "MuJoCoAcrobot",
+    "MuJoCoCartpole",
+    "MuJoCoPendulum",
+    "MuJoCoReacher",
+    "log_warnings",
+]

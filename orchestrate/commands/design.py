@@ -280,18 +280,13 @@ def _draw(target: Path, problem: Problem, motion: Motion) -> None:
     """Draw positions, velocities and torques of each joint, as shares of their limits."""
     from matplotlib.figure import Figure
 
-    limits = problem.limits
-    half = np.diff(limits.position, axis=1)[:, 0] / 2.0
-    shares = {
-        "position": (motion.positions - limits.middle) / half,
-        "velocity": motion.velocities / limits.velocity,
-        "torque": problem.body.torques(motion) / limits.torque,
-    }
+    parts = problem.limits.parts(motion, problem.body.torques(motion))
+    del parts["acceleration"]
     figure = Figure((8.0, 1.0 + 0.9 * problem.body.n), layout="constrained")
     axes = figure.subplots(problem.body.n, 1, sharex=True, squeeze=False)[:, 0]
     for k, (name, one) in enumerate(zip(problem.body.joints, axes, strict=True)):
-        for kind, share in shares.items():
-            one.plot(motion.times, share[:, k], lw=0.8, label=kind)
+        for kind, part in parts.items():
+            one.plot(motion.times, part[:, k], lw=0.8, label=kind)
         one.set(ylim=(-1.05, 1.05), yticks=(-1, 0, 1))
         one.set_ylabel(name, rotation=0, ha="right", fontsize=7)
     axes[0].legend(ncols=3, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0))

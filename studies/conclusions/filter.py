@@ -1,4 +1,4 @@
-"""Whether the intervals of the filter over state and parameters hold, and what its noise leaves.
+"""Coverage of the intervals of the filter over state and parameters, and what its noise leaves.
 
 Angles and places are measured with noise, rates are not. A state's interval has the variance of
 P + Ψ M⁻¹ Ψᵀ. What is predicted is the acceleration at the true state; its interval has the

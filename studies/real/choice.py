@@ -36,7 +36,7 @@ PLANT = dataclasses.replace(CASES["disk"].plant, delay=0.025)
 WIDTHS = (0, 8)
 POOL, MOST = 200, 30
 FACTOR = 1.15
-"""Error that is to be reached, by that of a fit to the whole pool."""
+"""Error that is to be reached, by the error of a fit to the whole pool."""
 
 AFTER = (2, 4, 10, 20, 30)
 """Numbers of segments after which errors are compared."""

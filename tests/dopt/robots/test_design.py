@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body
+from dopt.robots.body import Body, Motion
 from dopt.robots.design import Design, Problem, attainable, multisine
 from dopt.robots.limits import Limits
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
@@ -97,6 +97,39 @@ def test_torque_limits_shorten_motions(arm: Body, limits: Limits) -> None:
     assert not one.free or problem.strain(one.motion(0.04)) <= 1.0 + 1e-9
 
 
+class Dip(Family):
+    """Motion that is in the floor for 20 ms, between two rows of the search."""
+
+    name = "dip"
+    size = 1
+
+    def motion(self, numbers: np.ndarray, dt: float, reach: float = 1.0) -> Motion:  # noqa: ARG002  # one motion
+        t = dt * np.arange(round(self.seconds / dt))
+        positions = np.where(np.abs(t - 0.06) < 0.011, 1.2, 0.0)[:, None]
+        return Motion(dt, positions, 0.0 * positions, 0.0 * positions)
+
+
+def test_a_touch_between_the_rows_of_the_search_is_found_at_the_end(tmp_path: Path) -> None:
+    source = tmp_path / "fold.xml"
+    source.write_text(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+        <body pos="0 0 0.5"><joint name="hinge" axis="0 1 0" range="-2 2"/>
+        <geom type="capsule" fromto="0 0 0 0.6 0 0" size="0.02"/></body></worldbody></mujoco>"""
+    )
+    given = "joints: {hinge: {velocity: 2, acceleration: 9, torque: 40}}"
+    (tmp_path / "limits.yaml").write_text(given)
+    body = Body.load(source)
+    limits = Limits.of(body, tmp_path / "limits.yaml")
+    problem = Problem(body, limits, "mass", 3.0)
+    one = problem.candidate(Dip(limits, 3.0), np.zeros(1))
+    assert one.free
+    assert not problem.checked(one).free
+    design = Design.of(problem, effort=40)
+    assert not body.collisions(design.best.motion(0.005).positions)
+    touched = [body.collisions(each.motion(0.01).positions) for each in design.candidates]
+    assert [each.free for each in design.candidates] == [not found for found in touched]
+
+
 def test_designs_are_the_same_for_a_seed_and_differ_between_seeds(
     arm: Body, limits: Limits
 ) -> None:
@@ -134,7 +167,7 @@ def test_expected_errors_are_reached_by_a_fit_to_simulated_torques() -> None:
 def test_numbers_of_a_problem_are_positive(
     arm: Body, limits: Limits, name: str, value: float
 ) -> None:
-    with pytest.raises(SpecificationError, match=f"{name} of a design is .* but a positive"):
+    with pytest.raises(SpecificationError, match=f"{name} of a design is .* but a number above 0"):
         Problem(arm, limits, "damping", **({"seconds": 5.0} | {name: value}))
 
 

@@ -6,11 +6,10 @@ import pytest
 
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.robots.body import Body
-from dopt.robots.explorer import RobotExplorer, _on_sphere
+from dopt.robots.explorer import RobotExplorer
 from dopt.robots.friction import SPEEDS
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import KnownBody
-from dopt.sphere import maximize_on_sphere
 from studies.robots.online import LOOK, explore, true_values
 from studies.robots.simulated import SimulatedRobot, jaco
 
@@ -161,18 +160,6 @@ def test_the_step_of_torques_is_the_best_on_the_ball() -> None:
     random = np.random.default_rng(0).standard_normal((3, 500))
     others = 0.3 * random / np.linalg.norm(random, axis=0) * limits.torque[:, None]
     assert gain(chosen) >= max(gain(u) for u in others.T) - 1e-12
-
-
-@pytest.mark.parametrize("linear", [1.0, 1e-3, 0.0])
-def test_the_sphere_of_torques_agrees_with_the_kernel_s(linear: float) -> None:
-    random = np.random.default_rng(7)
-    for scale in (1e-8, 1.0):
-        half = random.standard_normal((5, 5))
-        Q, v = scale * half @ half.T, scale * linear * random.standard_normal(5)
-        found, expected = _on_sphere(Q, v, 0.3), maximize_on_sphere(Q, v, 0.3, np.ones(5))
-        worth = [u @ Q @ u - 2 * v @ u for u in (found, expected)]
-        assert np.linalg.norm(found) == pytest.approx(0.3)
-        assert worth[0] == pytest.approx(worth[1], rel=1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1.0])
