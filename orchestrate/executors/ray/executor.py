@@ -252,8 +252,11 @@ def _long_start() -> Iterator[None]:
 
 def _children() -> set[int]:
     """Return the process ids of the children of this process."""
-    lists = Path("/proc/self/task").glob("*/children")
-    return {int(number) for one in lists for number in one.read_text().split()}
+    found: set[int] = set()
+    for thread in Path("/proc/self/task").iterdir():
+        with suppress(OSError):  # the thread may end at this moment
+            found |= {int(number) for number in (thread / "children").read_text().split()}
+    return found
 
 
 def _raylet_lives() -> bool:

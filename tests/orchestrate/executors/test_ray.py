@@ -10,6 +10,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +39,7 @@ from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, R
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.conftest import ON_RAY, WORKERS
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
+from tests.orchestrate.faults.laboratory import children
 from tests.orchestrate.lean_ray import leave_services_out
 from tests.orchestrate.standins import BROKEN_SEED, quick, slow
 from tests.orchestrate.unruly import hanging
@@ -88,6 +92,28 @@ def test_a_slow_start_of_ray_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> N
     start(lambda: found.append(services.get_node()))
     assert found == [{"node": 1}]
     assert services.get_node.__name__ == "slow_query"
+
+
+@pytest.mark.parametrize("listed", [ray_start._children, lambda: set(children(os.getpid()))])
+def test_children_are_listed_while_threads_end(listed: Callable[[], set[int]]) -> None:
+    over = threading.Event()
+
+    def start_and_end() -> None:
+        while not over.is_set():
+            thread = threading.Thread(target=int)
+            thread.start()
+            thread.join()
+
+    with subprocess.Popen(["/bin/sleep", "600"]) as process, ThreadPoolExecutor(4) as pool:
+        threads = [pool.submit(start_and_end) for _ in range(4)]
+        try:
+            for _ in range(500):
+                assert process.pid in listed()
+        finally:
+            over.set()
+            process.kill()
+        for thread in threads:
+            thread.result()
 
 
 def test_a_raylet_that_has_ended_is_not_waited_for(

@@ -14,7 +14,7 @@ import tempfile
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -273,7 +273,8 @@ def children(pid: int) -> list[int]:
     """Return the processes that a process has started, whichever of its threads did."""
     found: list[int] = []
     for path in Path(f"/proc/{pid}/task").glob("*/children"):
-        found += map(int, path.read_text().split())
+        with suppress(OSError):  # the thread may end at this moment
+            found += map(int, path.read_text().split())
     return found
 
 
