@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from dopt.kernel import warm_up
+from dopt.kernel import compiling
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
@@ -131,7 +131,7 @@ def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Account
     """Run the trials of one configuration on the local executor."""
     settings = LaunchSettings(executor="local", store_url=url, workers=workers)
     grid = Grid(list(specs), n_jobs=len(specs), left_out={})
-    work = Work(run_trial, warm_up)
+    work = Work(run_trial, compiling)
     code = launch_grid(grid, settings, RECORD, work, say=_nothing, stream=None)
     if code is not ExitCode.DONE:
         raise RuntimeError(f"the launch ended with {code!r}, but {ExitCode.DONE!r} is expected.")

@@ -257,11 +257,23 @@ def mark_complete(what: str, files: Sequence[str] | None = None) -> None:
 
 def missing(names: Sequence[str]) -> list[str]:
     """Return the names of the functions of which the cache holds nothing, or something damaged."""
+    marks = _marks_of(names)
+    return [name for name in names if not marks[name] or not all(map(is_complete, marks[name]))]
+
+
+def files_of(names: Sequence[str]) -> list[str]:
+    """Return the files that hold the functions of the cache with these names."""
+    marks = [f"{mark}.complete" for found in _marks_of(names).values() for mark in found]
+    return [line for mark in marks for line in (read(mark) or b"").decode().splitlines()]
+
+
+def _marks_of(names: Sequence[str]) -> dict[str, list[str]]:
+    """Return the marks of functions, one for each signature that was compiled."""
     marks: dict[str, list[str]] = {name: [] for name in names}
     for stem in [path.stem for path in CACHE_FOLDER.glob("*.complete")]:
         for name in marks.keys() & {stem, stem.rpartition("-")[0]}:
             marks[name].append(stem)
-    return [name for name in names if not marks[name] or not all(map(is_complete, marks[name]))]
+    return marks
 
 
 ENDS = ("first", "last")
@@ -274,9 +286,17 @@ _PROGRAM = "dopt.kernel.warming"
 
 
 def compile_missing(names: Sequence[str]) -> None:
+    """Compile the parts that the cache does not hold, as :func:`compiling` does, and wait."""
+    with compiling(names):
+        pass
+
+
+@contextlib.contextmanager
+def compiling(names: Sequence[str]) -> Iterator[None]:
     """Compile the parts that the cache does not hold, in one process on each of two cores.
 
-    What they could not compile is left to the process that needs it.
+    The block runs meanwhile; at its end they are waited for. What they could not compile is left
+    to the process that needs it.
 
     Parameters
     ----------
@@ -285,10 +305,12 @@ def compile_missing(names: Sequence[str]) -> None:
     """
     needed = [] if PLAIN else missing(names)
     if not needed or not can_be_filled():
+        yield
         return
     start, next_message, spoke, over = time.perf_counter(), 0.0, False, False
     running = [_started(end, needed) for end in ENDS[: usable_cores()]]
     try:
+        yield
         while not over:
             over = all(process.poll() is not None for process in running)
             seconds = time.perf_counter() - start

@@ -61,7 +61,7 @@ class CompiledSteps(NamedTuple):
 
 def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
     """Compile the loop for a trial, with the functions of its policy and its learner."""
-    kinds = layout_of((trial, points, *other_steps(trial).values()))
+    kinds = layout_of((trial, points, *_others(trial).values()))
     key = (kinds, _source(policy), _source(learner))
     if key not in _trials:
         steps = _compiled_parts(policy, learner, trial, [hold, loop.advance])
@@ -97,22 +97,26 @@ OTHER_STEPS = {
 """Functions of a trial's steps beside its policy and learner: the usual one, and the other."""
 
 
-def other_steps(trial: Trial) -> dict[str, CompiledFunction]:
+def other_steps(limited: bool, measured: bool, integrator: int) -> dict[str, CompiledFunction]:
     """Return which of :data:`OTHER_STEPS` a trial calls."""
-    limited, measured = trial.limits.enforced, len(trial.sensors.output_matrix) > 0
-    others = (limited, limited, measured, trial.plant.integrator != Integrator.EULER)
+    others = (limited, limited, measured, integrator != Integrator.EULER)
     return {
         name: choices[other]
         for (name, choices), other in zip(OTHER_STEPS.items(), others, strict=True)
     }
 
 
+def _others(trial: Trial) -> dict[str, CompiledFunction]:
+    measured = len(trial.sensors.output_matrix) > 0
+    return other_steps(trial.limits.enforced, measured, trial.plant.integrator)
+
+
 def _compiled_parts(
     policy: Policy, learner: Learner, trial: Trial, callers: list[CompiledFunction]
 ) -> Steps:
     """Compile what a trial needs; the callers are compiled by whoever calls this."""
-    others, kinds = other_steps(trial), step_kinds(trial)
-    compile_missing(_names(policy, learner, [*trial.information, *others.values(), *callers]))
+    others, kinds = _others(trial), step_kinds(trial)
+    compile_missing(names_of(policy, learner, [*trial.information, *others.values(), *callers]))
     for name, function in trial.information._asdict().items():
         compile_form(trial, name, function)
     for name, function in others.items():
@@ -121,7 +125,7 @@ def _compiled_parts(
     return Steps(plan, learn, **others)
 
 
-def _names(policy: Policy, learner: Learner, functions: list[CompiledFunction]) -> list[str]:
+def names_of(policy: Policy, learner: Learner, functions: list[CompiledFunction]) -> list[str]:
     """Return the names in the cache of what a trial needs of the package."""
     sources = (*map(path_of, functions), _source(policy), _source(learner))
     package = f"{__package__}."

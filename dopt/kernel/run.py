@@ -123,7 +123,7 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
 
 def trial_in_kernel(spec: TrialSpec) -> KernelTrial | SteppedTrial:
     """Return a trial before its first step."""
-    return SteppedTrial(spec) if is_stepped(spec) else KernelTrial(spec)
+    return SteppedTrial(spec) if is_stepped(spec.config) else KernelTrial(spec)
 
 
 def _advance_in_pieces(trial: KernelTrial | SteppedTrial, last: int) -> None:

@@ -300,9 +300,9 @@ class KernelSteps(KernelState):
         return finite
 
 
-def is_stepped(spec: TrialSpec) -> bool:
+def is_stepped(config: TrialConfig) -> bool:
     """Return whether the interpreter takes the steps of a trial one by one."""
-    return isinstance(spec.system, BlackBox) or NumpyParts.needed_by(spec.config)
+    return isinstance(config.system, BlackBox) or NumpyParts.needed_by(config)
 
 
 class SteppedTrial(KernelSteps):

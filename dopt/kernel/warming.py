@@ -14,7 +14,7 @@ tested.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,10 +24,13 @@ from numba.core.codegen import CPUCodeLibrary
 from numba.core.cpu import CPUContext
 from numba.core.targetconfig import ConfigStack
 
+from dopt.algorithm import Integrator
 from dopt.kernel import cache, loop
 from dopt.kernel.equations import compiled_equations, name_of_equations
+from dopt.kernel.from_spec import information_of
 from dopt.kernel.gaussian_process import negative_evidence, refactor, thin
-from dopt.kernel.information import FORMS, NETWORK
+from dopt.kernel.held import hold
+from dopt.kernel.information import ABSENT, FORMS, NETWORK, OF_OTHER_MODELS
 from dopt.kernel.loop import advance, evaluate_next
 from dopt.kernel.pointers import (
     BETWEEN,
@@ -40,14 +43,18 @@ from dopt.kernel.pointers import (
     compiled_loop,
     compiled_step,
     kind_of,
+    names_of,
+    other_steps,
     path_of,
     step_kinds,
 )
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.steps import NumpyParts, is_stepped
 from dopt.kernel.structs import Information
-from dopt.learning import LEARNERS, Adam
-from dopt.policies import POLICIES, DOptimal
+from dopt.learning import LEARNERS, Adam, RecursiveLeastSquares
+from dopt.policies import POLICIES, DOptimal, Periodic, Uniform
 from dopt.process import collect_rarely
+from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from dopt.types import CompiledFunction
@@ -109,7 +116,11 @@ class Choices(NamedTuple):
 def choices(everything: bool) -> Choices:
     """Return what a trial of the paper needs, or all that the package holds."""
     if not everything:
-        return Choices([DOptimal.kernel_function], [Adam.kernel_function], [NETWORK])
+        return Choices(
+            [policy.kernel_function for policy in (DOptimal, Uniform, Periodic)],
+            [learner.kernel_function for learner in (Adam, RecursiveLeastSquares)],
+            (NETWORK, OF_OTHER_MODELS, ABSENT),
+        )
     plans = {policy.kernel_function for policy in POLICIES.values() if policy.compiled}
     learns = {learner.kernel_function for learner in LEARNERS.values() if learner.compiled}
     return Choices(
@@ -155,6 +166,24 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
             if everything
         },
     }
+
+
+def needed_parts(configs: Iterable[TrialConfig]) -> list[str]:
+    """Return the names in the cache of what the trials of configurations call of the package."""
+    shipped = {name_of_equations(system()) for system in SYSTEMS.values()}
+    found: dict[str, None] = {}
+    for config in configs:
+        callers: list[CompiledFunction] = [hold, advance]
+        if is_stepped(config):
+            callers = [*STEPS, evaluate_next, *(BETWEEN if NumpyParts.needed_by(config) else ())]
+        system, limited = config.system, config.limits is not None and config.limits.enforced
+        integrator = Integrator[system.integrator.upper()]
+        others = other_steps(limited, len(system.output_rows) > 0, integrator)
+        functions = [*callers, *others.values(), *information_of(config)]
+        found |= dict.fromkeys(names_of(config.policy, config.learner, functions))
+        if (name := name_of_equations(config.system)) in shipped:
+            found[name] = None
+    return [*found]
 
 
 def compile_parts(end: str, names: Container[str]) -> None:

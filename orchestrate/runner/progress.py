@@ -21,7 +21,10 @@ LINE_INTERVAL_SECONDS = 10.0
 """Interval of progress lines if the output is not a terminal."""
 
 RATE_WINDOW_SECONDS = 30.0
-"""Period over which the rate is averaged."""
+"""Period over which the rate is averaged, at most."""
+
+SLOW_SHARE = 1 / 3
+"""Share of the outcomes so far, the first ones, that do not count for the rate: workers start."""
 
 SHARE_BEFORE_ESTIMATE = 0.1
 """Share of the trials of a launch before which its rate, of workers that start, says nothing."""
@@ -96,7 +99,10 @@ class Progress:
         """Record the current tally, and print a line when one is due."""
         now = time.monotonic()
         self._recent.append((now, self._tally.over))
-        while len(self._recent) > 2 and self._recent[0][0] < now - RATE_WINDOW_SECONDS:
+        slow = SLOW_SHARE * self._tally.over
+        while len(self._recent) > 2 and (
+            self._recent[0][0] < now - RATE_WINDOW_SECONDS or self._recent[1][1] <= slow
+        ):
             self._recent.popleft()
         if self._live is None and now - self._shown >= LINE_INTERVAL_SECONDS:
             self._shown = now

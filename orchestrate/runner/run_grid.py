@@ -6,18 +6,20 @@ import itertools
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TextIO
 
-from dopt.kernel import warm_up
+from dopt.kernel import compiling, kinds_of
 from dopt.run import run_trial
+from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Job, Prepare, Run, executor_factory, make_executor, make_job
+from orchestrate.executors.base import Executor, Job, Run, executor_factory, make_executor, make_job
 from orchestrate.program import exit_code
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
 from orchestrate.runner.saving import Heartbeat, RetryingStore
@@ -45,15 +47,20 @@ COMPILING = "compiling the kernel: this takes up to a minute, and later launches
 Say = Callable[[str], None]
 
 
+Preparation = Callable[[Sequence[TrialConfig]], AbstractContextManager[object]]
+"""Takes configurations of the kernel, one of each kind; a context manager, which prepares for their
+trials while its block runs and has done so at the block's end."""
+
+
 @dataclass(frozen=True)
 class Work:
-    """Function that runs a trial, and function that is called once before the first trial."""
+    """Function that runs a trial, and what prepares a machine for trials."""
 
     run: Run
-    prepare: Prepare
+    prepare: Preparation = nullcontext
 
 
-WORK = Work(run_trial, warm_up)
+WORK = Work(run_trial, compiling)
 """Functions of a real launch."""
 
 
@@ -196,12 +203,9 @@ def _run_stages(
     output: Output,
 ) -> bool:
     """Run the stages with one executor; return whether an interrupt left trials of them."""
-    compiled = any(trial.config.path == "kernel" for trial in grid.trials)
-    prepare = work.prepare if compiled else None
-    if prepare:
-        prepare_workers(prepare, output.warn)
-    start = time.monotonic()
-    with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
+    configs = {trial.config_key: trial.config for trial in grid.trials}
+    with started(settings, work, configs.values(), output.warn) as executor, Interrupt() as stop:
+        start = time.monotonic()
         chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
         scheduler = Scheduler(
             store, executor, chunks, tally, stop, settings.fail_fast, settings.retry_memory
@@ -217,14 +221,30 @@ def _run_stages(
     return stop.stop_requested and tally.left > 0
 
 
-def prepare_workers(prepare: Prepare, warn: Say) -> None:
-    """Compile the kernel, or load it; announce a compilation that takes long."""
+@contextmanager
+def started(
+    settings: LaunchSettings, work: Work, configs: Iterable[TrialConfig], warn: Say
+) -> Iterator[Executor]:
+    """Start the executor while the kernel compiles, and stop it at the end of the block.
+
+    The launch says so if that takes long. Machines of a cluster compile before their first trial.
+    """
+    kinds = [*kinds_of(config for config in configs if config.path == "kernel").values()]
+    prepare = partial(_prepare, work.prepare, kinds) if kinds else None
     timer = threading.Timer(ANNOUNCE_AFTER_SECONDS, warn, [COMPILING])
-    timer.start()
-    try:
-        prepare()
-    finally:
+    with ExitStack() as held:
+        with work.prepare(kinds) if kinds else nullcontext():
+            executor = held.enter_context(make_executor(settings, work.run, prepare))
+            if kinds:
+                timer.start()
+                held.callback(timer.cancel)
         timer.cancel()
+        yield executor
+
+
+def _prepare(prepare: Preparation, kinds: Sequence[TrialConfig]) -> None:
+    with prepare(kinds):
+        pass
 
 
 def _drive(scheduler: Scheduler, grid: Grid, progress: Progress) -> None:

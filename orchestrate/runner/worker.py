@@ -17,11 +17,11 @@ from types import FrameType
 
 from dopt.errors import DoptError
 from dopt.process import usable_cores
-from dopt.spec.config import completed
+from dopt.spec.config import TrialConfig, completed
 from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config.launch_settings import LaunchSettings, factor
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Task, make_executor
+from orchestrate.executors.base import Task
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
 from orchestrate.runner.progress import (
@@ -36,8 +36,8 @@ from orchestrate.runner.run_grid import (
     WORK,
     Output,
     Work,
-    prepare_workers,
     recorded_launch,
+    started,
     worked,
 )
 from orchestrate.runner.saving import RetryingStore, launch_record
@@ -178,11 +178,9 @@ def _work(
     chunks = StoredChunks(store, launch.chunk_seconds, slots, length, output.warn)
     chunks.look()
     output.say(f"{chunks.waiting:,} trials wait, {slots} processes · {store.safe_url}")
-    if chunks.compiled:
-        prepare_workers(work.prepare, output.warn)
     tally = Tally(chunks.left)
     interrupt = Interrupt(WARNINGS, NOTICE, store.hurry)
-    with make_executor(launch, work.run) as executor, interrupt:
+    with started(launch, work, chunks.configs, output.warn) as executor, interrupt:
         leave = Leave(interrupt, _length(settings.seconds, start))
         scheduler = Scheduler(
             store, executor, chunks, tally, leave, retry_memory=launch.retry_memory
@@ -328,9 +326,9 @@ class StoredChunks(Chunks):
                 self.add_exclusive([by_id[trial.config_id].first.with_seed(trial.seed)])
 
     @property
-    def compiled(self) -> bool:
-        """Whether the kernel runs some of the trials."""
-        return any(kind.first.config.path == "kernel" for kind in self._kinds.values())
+    def configs(self) -> list[TrialConfig]:
+        """Configurations that have open trials and can run here."""
+        return [kind.first.config for kind in self._kinds.values()]
 
     @property
     def waiting(self) -> int:

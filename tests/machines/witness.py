@@ -12,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from dopt.kernel import warm_up
+from dopt.kernel import compiling
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -55,5 +55,5 @@ def read_notes(home: Path, kind: str) -> dict[int, float]:
 if __name__ == "__main__":
     from tests.machines.witness import witnessed as importable  # by a name that workers know
 
-    start.WORK = Work(importable, warm_up)
+    start.WORK = Work(importable, compiling)
     sys.exit(launch.main())

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -147,9 +148,10 @@ class Launches:
         self.report[name] = {"code": code, "error": error}
 
     @staticmethod
-    def _prepare(notes: Notes, name: str) -> None:
+    def _prepare(notes: Notes, name: str, _: object) -> AbstractContextManager[None]:
         if ray.is_initialized():
             notes.add(f"prepared-{name}")
+        return nullcontext()
 
 
 def run_all(folder: Path) -> None:

@@ -37,7 +37,7 @@ class Launches:
     ) -> ExitCode:
         grid = Grid([specification(seed) for seed in range(seeds)], n_jobs=seeds, left_out={})
         chosen = LaunchSettings(executor=executor, store_url=self.url, **{"workers": 2, **settings})
-        work = Work(run, prepare=lambda: None)
+        work = Work(run)
         return launch_grid(grid, chosen, RECORD, work, self.said.append, stream=None)
 
     def statuses(self) -> dict[int, str]:
@@ -77,5 +77,5 @@ def command_line(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.delenv("DOPT_DB", raising=False)
-    monkeypatch.setattr(start, "WORK", Work(quick, prepare=lambda: None))
+    monkeypatch.setattr(start, "WORK", Work(quick))
     return run

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -214,7 +214,7 @@ def test_every_policy_runs_behind_real_hardware(command_line: Command, tmp_path:
 def test_a_failed_trial_says_how_to_run_it_again(
     command_line: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(raising, prepare=lambda: None))
+    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(raising))
     code, output, _ = command_line("seed=2", *SHORT)
     assert (code, "failed with ZeroDivisionError" in output) == (1, True)
     assert "launch.retry" not in output
@@ -229,7 +229,12 @@ def test_a_slow_preparation_is_announced_also_for_a_single_trial(
     command_line: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("orchestrate.runner.run_grid.ANNOUNCE_AFTER_SECONDS", 0.01)
-    prepare = partial(time.sleep, 0.5)
+
+    @contextmanager
+    def prepare(_: object) -> Iterator[None]:
+        yield
+        time.sleep(0.5)
+
     monkeypatch.setattr("orchestrate.runner.start.WORK", Work(quick, prepare))
     code, _, errors = command_line(*SHORT)
     assert (code, errors.startswith("compiling the kernel")) == (0, True)
@@ -251,7 +256,7 @@ def test_where_numba_is_disabled_nothing_is_registered(
 def test_a_trial_that_finds_the_machine_unusable_ends_the_launch_with_its_sentence(
     command_line: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(unusable, prepare=lambda: None))
+    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(unusable))
     code, _, errors = command_line("seed=2", *SHORT)
     assert (code, errors) == (2, "error: the machine has no compiler: install one\n")
     assert command_line("-m", "seed=2,3", *SHORT)[0] == 2
@@ -318,7 +323,7 @@ def test_a_failure_may_say_what_no_terminal_shows(
     def unspeakable(_: TrialSpec) -> TrialResult:
         raise OSError("cannot read \udcff")
 
-    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(unspeakable, prepare=lambda: None))
+    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(unspeakable))
     code, out, _ = command_line("-m", "seed=0", "env.horizon=5", "executor=inprocess")
     assert code == 1
     assert r"1 failed: OSError: cannot read \udcff" in out

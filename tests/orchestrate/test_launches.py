@@ -97,7 +97,7 @@ def launched(folder: Path, executor: str, trials: Grid) -> str:
     """Run a grid of real trials into a database of its own; return its URL."""
     url = f"sqlite:///{folder / executor}.db"
     settings = LaunchSettings(executor=executor, store_url=url, workers=2)
-    work = Work(run_trial, prepare=lambda: None)
+    work = Work(run_trial)
     code = launch_grid(trials, settings, RECORD, work, lambda _: None, stream=None)
     assert code is ExitCode.DONE
     return url

@@ -95,7 +95,7 @@ SHARED_TRIALS, SHARES, HORIZON = 10_000, 20, 50
 
 
 def run(grid: Grid, settings: LaunchSettings) -> None:
-    work = Work(outcome, prepare=lambda: None)
+    work = Work(outcome)
     assert launch_grid(grid, settings, RECORD, work, lambda _: None, None) == ExitCode.DONE
 
 

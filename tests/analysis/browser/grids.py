@@ -122,7 +122,7 @@ def launch(url: str, seeds: int, folder: Path) -> int:
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(seeds), **SHORT)
     settings = LaunchSettings(executor="inprocess", store_url=url, workers=1)
     record = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
-    work = Work(Gated(fake_result, Gate(folder)), prepare=lambda: None)
+    work = Work(Gated(fake_result, Gate(folder)))
     grid = Grid(specs, n_jobs=len(specs), left_out={})
     return int(launch_grid(grid, settings, record, work, lambda _: None, stream=None))
 

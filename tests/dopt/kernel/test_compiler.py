@@ -23,11 +23,12 @@ from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import content_digest
+from dopt.kernel.equations import name_of_equations
 from dopt.kernel.from_spec import network_of
 from dopt.kernel.information import FORMS
 from dopt.kernel.pointers import function_of
-from dopt.kernel.run import KernelTrial
-from dopt.kernel.warming import choices, kernel_parts
+from dopt.kernel.run import KernelTrial, trial_in_kernel
+from dopt.kernel.warming import choices, kernel_parts, needed_parts
 from dopt.learning import LEARNERS
 from dopt.learning.base import Learner
 from dopt.models import Model
@@ -159,6 +160,54 @@ def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatc
         "dopt.kernel.information.network_forms",
     }
     assert set(asked) <= {*kernel_parts(everything=True)}
+
+
+GRID = {
+    "paper": [("pendulum", policy) for policy in ("d_optimal", "random", "periodic", "uniform")],
+    "search": [("cartpole", "lookahead"), ("arm", "icem")],
+    "numpy": [("pendulum", "max")],
+    "measured": [
+        ({"name": "pendulum", "measured_states": [0], "measurement_noise": [0.01]}, "random")
+    ],
+}
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_a_grid_compiles_what_its_trials_ask_for_and_no_more(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A part that were missing would be compiled while the workers wait for it."""
+    specs = [TrialSpec.from_names(system, policy) for system, policy in GRID[name]]
+    asked: list[str] = []
+    monkeypatch.setattr(pointers, "compile_missing", asked.extend)
+    monkeypatch.setattr(pointers, "_trials", {})
+    for spec in specs:
+        trial_in_kernel(spec).advance(1)
+    systems = {name_of_equations(spec.system) for spec in specs}
+    assert {*needed_parts(spec.config for spec in specs)} == {*asked} | systems
+
+
+def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "from dopt.kernel import compiling\n"
+        "from dopt.spec.trial import TrialSpec\n"
+        "system = {'name': 'mass_spring', 'horizon': int(sys.argv[1])}\n"
+        "with compiling([TrialSpec.from_names(system, 'random').config]):\n"
+        "    print('numba' in sys.modules)\n"
+    )
+    environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", program, horizon],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for horizon in ("100", "200")
+    ]
+    assert answers == ["True\n", "False\n"]
 
 
 def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ from orchestrate.commands.status import watch
 from orchestrate.executors.base import Event, InProcessExecutor, Task
 from orchestrate.fingerprint import fingerprint
 from orchestrate.program import UsageError, length_of_time, visible
-from orchestrate.runner import worker
+from orchestrate.runner import run_grid, worker
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import (
     Claim,
@@ -349,8 +349,8 @@ def pull(
     """Return a function that runs commands, and trials of stand-ins in this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DOPT_DB", raising=False)
-    monkeypatch.setattr(worker, "WORK", Work(raising, prepare=lambda: None))
-    monkeypatch.setattr(worker, "make_executor", lambda _, run: InProcessExecutor(run))
+    monkeypatch.setattr(worker, "WORK", Work(raising))
+    monkeypatch.setattr(run_grid, "make_executor", lambda _, run, __: InProcessExecutor(run))
 
     def run(*words: str) -> tuple[int, str, str]:
         code = main(words)
@@ -379,10 +379,10 @@ def test_a_worker_that_can_run_no_trial_hands_back_what_it_holds(
     command_line: Launch, pull: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command_line(*GRID, LEAVE)
-    monkeypatch.setattr(worker, "WORK", Work(unusable, prepare=lambda: None))
+    monkeypatch.setattr(worker, "WORK", Work(unusable))
     code, _, errors = pull("work", "--processes", "1")
     assert (code, errors.splitlines()[-1]) == (2, "error: the machine has no compiler: install one")
-    monkeypatch.setattr(worker, "WORK", Work(quick, prepare=lambda: None))
+    monkeypatch.setattr(worker, "WORK", Work(quick))
     assert pull("work")[0] == 0
 
 
@@ -428,7 +428,7 @@ def test_a_trial_that_was_taken_away_is_not_run_twice_at_once(
             self.held |= {*keys(chunk)}
 
     executor = Watched(fate)
-    monkeypatch.setattr(worker, "make_executor", lambda *_: executor)
+    monkeypatch.setattr(run_grid, "make_executor", lambda *_: executor)
     code, out, _ = pull("work")
     assert "results refused: the lease had run out" in out
     assert "6 trials done" in out
@@ -498,7 +498,7 @@ def test_every_trial_is_rebuilt_as_it_was_registered(command_line: Launch, pull:
         ran.append(spec)
         return raising(spec)
 
-    worker.WORK = Work(run, prepare=lambda: None)  # type: ignore[arg-type]
+    worker.WORK = Work(run)  # type: ignore[arg-type]
     command_line(*GRID, LEAVE)
     pull("work")
     assert len({spec.trial_key for spec in ran}) == 6

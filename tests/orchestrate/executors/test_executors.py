@@ -327,7 +327,7 @@ from orchestrate.runner.run_grid import Work
 from tests.orchestrate.standins import quick
 
 if __name__ == "__main__":
-    start.WORK = Work(quick, prepare=lambda: None)
+    start.WORK = Work(quick)
     code = launch.main()
     print(json.dumps([code, sorted({"ray", "torch"} & set(sys.modules))]))
 """

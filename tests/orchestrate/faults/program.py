@@ -106,7 +106,7 @@ def _launch(order: Order) -> int:
     local._kills_for_memory = lambda: 0
     scheduler.MAX_LONE_LOSSES = order.lone_losses or scheduler.MAX_LONE_LOSSES
     run = Gated(Standin(order.seconds, order.trouble), Gate(Path(order.gate)))
-    work = Work(run, prepare=lambda: None)
+    work = Work(run)
     if order.worker is not None:
         return _pull(order, work)
     start.WORK = work

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from dopt.errors import UnusableEnvironmentError
+from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
@@ -132,7 +134,12 @@ def test_a_launch_waits_for_the_trials_of_a_living_one(launches: Launches) -> No
 def test_the_kernel_is_made_ready_where_a_trial_needs_it(
     tmp_path: Path, models: tuple[str, ...], prepared: int
 ) -> None:
-    calls: list[None] = []
+    calls: list[Sequence[TrialConfig]] = []
+
+    def prepare(configs: Sequence[TrialConfig]) -> AbstractContextManager[None]:
+        calls.append(configs)
+        return nullcontext()
+
     sections = {
         "in_torch": {"_target_": "tests.dopt.custom_networks.Stack"},
         "mlp": {"name": "mlp"},
@@ -144,9 +151,9 @@ def test_the_kernel_is_made_ready_where_a_trial_needs_it(
     ]
     grid = Grid(trials, n_jobs=len(trials), left_out={})
     settings = LaunchSettings("inprocess", f"sqlite:///{tmp_path / 'results.db'}")
-    work = Work(quick, prepare=lambda: calls.append(None))
+    work = Work(quick, prepare)
     assert launch_grid(grid, settings, RECORD, work, lambda _: None, stream=None) == ExitCode.DONE
-    assert len(calls) == prepared
+    assert sum(map(len, calls)) == prepared
 
 
 Fate = Callable[[Sequence[Task], int], list[Event]]

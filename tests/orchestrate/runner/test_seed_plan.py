@@ -83,7 +83,7 @@ class Adaptive(Launches):
         self.said = []
         chosen = {"executor": "inprocess", "workers": 2, **settings}
         made = LaunchSettings(store_url=self.url, until=until, **chosen)  # type: ignore[arg-type]
-        work = Work(run, prepare=lambda: None)
+        work = Work(run)
         return launch_grid(of or grid(), made, RECORD, work, self.said.append, stream=None)
 
     @property
