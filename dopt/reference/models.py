@@ -111,7 +111,9 @@ def network_function(system: System, module: nn.Module) -> BatchModel:
     """Return a_θ for any module that maps the features, (p,), to accelerations, (r,).
 
     The flat vector holds the module's parameters in the order of ``module.named_parameters()``.
+    A module that gives the same for many points at once, (N, p), is called once for them.
     """
+    tied = len([*module.named_parameters(remove_duplicate=False)]) > len([*module.parameters()])
     shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
     lengths = [shape.numel() for shape in shapes.values()]
     buffers = dict(module.named_buffers())
@@ -123,11 +125,17 @@ def network_function(system: System, module: nn.Module) -> BatchModel:
             for (name, shape), part in zip(shapes.items(), parts, strict=True)
         }
         weights |= {name: buffer.to(phi.device) for name, buffer in buffers.items()}
-        out: Tensor = functional_call(module, weights, (phi,))
+        out: Tensor = functional_call(module, weights, (phi,), tie_weights=tied)
         return out
 
-    over_points = vmap(network, in_dims=(None, 0))
-    over_trials, over_both = vmap(network), vmap(over_points)
+    one_by_one = vmap(network, in_dims=(None, 0))
+    over_trials, over_both = vmap(network), vmap(one_by_one)
+    at_once: list[bool] = []  # not empty once the module has been tried
+
+    def over_points(theta: Tensor, phi: Tensor) -> Tensor:
+        if not at_once:
+            at_once.append(_maps_many(network, theta, phi, one_by_one(theta, phi)))
+        return network(theta, phi) if at_once[0] else one_by_one(theta, phi)
 
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
         phi = features(system, x).expand(len(theta), -1, -1)
@@ -139,6 +147,15 @@ def network_function(system: System, module: nn.Module) -> BatchModel:
         return one.view(1, points, -1)
 
     return accelerations
+
+
+def _maps_many(network: BatchModel, theta: Tensor, phi: Tensor, expected: Tensor) -> bool:
+    """Return whether a network maps points, (N, p), to what it maps them to one by one."""
+    with torch.no_grad():
+        try:
+            return torch.allclose(network(theta, phi), expected, rtol=1e-12, atol=1e-13)
+        except (RuntimeError, IndexError, TypeError, ValueError):  # a user's module
+            return False
 
 
 def linear_function(system: System) -> BatchModel:
@@ -415,7 +432,7 @@ class BatchInformation:
         along = self._held @ J.mT
         factor = cholesky_factor(torch.eye(J.shape[1]).to(J) + J @ along)
         roots = torch.linalg.solve_triangular(factor, along.mT, upper=False)
-        self._held = torch.baddbmm(self._held, roots.mT, roots, alpha=-1)
+        self._held.baddbmm_(roots.mT, roots, alpha=-1)
 
     def solve(self, columns: Tensor) -> Tensor:
         """Return M⁻¹ C, (n, s, c), for columns C (n, s, c)."""

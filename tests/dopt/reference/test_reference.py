@@ -35,7 +35,7 @@ from dopt.reference.models import (
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.custom_networks import for_one
+from tests.dopt.custom_networks import Stack, for_one
 from tests.dopt.trials import PAIRS, SMALL_SEARCHES, trial
 from tests.paths import EXAMPLE
 
@@ -185,6 +185,41 @@ def test_a_network_that_does_not_use_a_parameter_has_zeros_there() -> None:
     J = jacobian(function, 1, theta, x)
     assert torch.equal(J[..., 4:], torch.zeros_like(J[..., 4:]))
     assert bool((J[..., :4] != 0).all())
+
+
+class Noted(Stack):
+    """Notes the dimensions of what it is called with."""
+
+    called_with: list[int]
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        self.called_with.append(features.dim())
+        return super().forward(features)
+
+
+class Coupled(Noted):
+    """What it makes of a point depends on the points beside it."""
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return super().forward(features) - features.mean()
+
+
+@pytest.mark.parametrize(("kind", "at_once"), [(Noted, [2]), (Coupled, [1])])
+def test_a_network_is_called_once_for_many_points_where_that_gives_the_same(
+    kind: type[Noted], at_once: list[int]
+) -> None:
+    system, rng = SYSTEMS["pendulum"](), np.random.default_rng(1)
+    module = kind(len(system.features), system.n_learned).double()
+    module.called_with = []
+    theta = torch.nn.utils.parameters_to_vector(module.parameters()).detach()[None]
+    states = torch.tensor(rng.standard_normal((1, 7, system.n_states)))
+    function = network_function(system, module)
+    one_by_one = [function(theta, states[:, i : i + 1])[0, 0] for i in range(7)]
+    for _ in range(2):  # the first time it is tried
+        module.called_with.clear()
+        many = function(theta, states)[0]
+        assert torch.allclose(many, torch.stack(one_by_one), rtol=1e-12, atol=1e-13)
+    assert module.called_with == at_once
 
 
 SIZES = (7, SMALL, SMALL + 1, 150)
