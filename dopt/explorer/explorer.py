@@ -296,7 +296,7 @@ class Explorer(SavedExplored):
             If all steps are done.
         """
         x, now = self._measured(state), seconds(time)
-        with uninterrupted(), self._lock:
+        with uninterrupted(), self._lock, self._timed(0):
             self._require_step()
             if not self._is_usable(x):
                 self._wait()
@@ -362,7 +362,7 @@ class Explorer(SavedExplored):
         """
         x, now = self._measured(state), seconds(time)
         u = None if applied is None else finite("applied", applied, self.spec.system.n_inputs)
-        with uninterrupted(), self._lock:
+        with uninterrupted(), self._lock, self._timed(1):
             self._require_step()
             self._wait()
             self._told = np.array(state, dtype=float), now
