@@ -122,7 +122,10 @@ JOIN assessment u ON u.trial_id = v.trial_id AND u.measure = 'useful'
 JOIN assessment w ON w.trial_id = v.trial_id AND w.measure = 'window'
 WHERE v.policy = 'recorded' ORDER BY v.trial_id DESC
 """
-_STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id ORDER BY t"
+_STEPS = """
+SELECT t, loss, reachable_loss, plan_us + learn_us AS us FROM step
+WHERE trial_id = :trial_id ORDER BY t
+"""
 
 
 def legend_entry(policy: str) -> Content:
@@ -474,6 +477,7 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
             if system
         ],
         "spectrum": _spectrum(inputs, row["dt"], system),
+        "durations": _durations([step["us"] for step in steps if step["us"]]),
         "phase": _phase(states, system) if system else None,
     }
 
@@ -544,6 +548,22 @@ def _phase(states: Array, system: System) -> Content:
         "labels": plane.labels,
         "angles": plane.angles,
         "box": plane.box,
+    }
+
+
+PARTS_OF_TEN = 10
+"""Bars of the histogram from a time to its tenfold."""
+
+
+def _durations(us: Sequence[float]) -> Content:
+    """Return a histogram of times [µs] of plans and learning, (k,) each, and their quantiles."""
+    if not us:
+        return {"us": [], "steps": [], "quantiles": []}
+    places = np.floor(PARTS_OF_TEN * np.log10(us)).astype(int)
+    return {
+        "us": 10.0 ** ((np.arange(places.min() - 1, places.max() + 2) + 0.5) / PARTS_OF_TEN),
+        "steps": [0, *np.bincount(places - places.min()).tolist(), 0],  # an axis has a length
+        "quantiles": np.quantile(us, [0.5, 0.99, 1.0]),
     }
 
 

@@ -32,7 +32,7 @@ from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside, first_evidence, first_simulation
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
-from dopt.learning import Conditioning, Learner, SimulationError
+from dopt.learning import Conditioning, GaussNewton, Learner, SimulationError
 from dopt.models import Model
 from dopt.policies import Policy
 from dopt.spec.config import LARGEST_HORIZON, completed
@@ -134,7 +134,7 @@ class Explorer(SavedExplored):
     ``missed``
         questions that were answered with the fallback, because the plan was not ready in time
     ``refits``
-        fits of the learner 'simulation_error' that came into force
+        fits beside the exploration that came into force
     ``unmoved``
         stretches of 100 learned steps in which no parameter moved
     ``late``
@@ -182,7 +182,7 @@ class Explorer(SavedExplored):
         Whether events are on the disk, and not only in the file, before a call returns.
     deadline : float, optional
         Seconds that :meth:`ask` waits for a plan. Then it returns the fallback. With one,
-        :meth:`tell` does not wait for fits of the learner 'simulation_error'.
+        :meth:`tell` does not wait for fits beside the exploration.
     fallback : (m,), optional
         A safe input, 0 unless it is given.
     tolerance : float
@@ -267,6 +267,8 @@ class Explorer(SavedExplored):
         self._fits: FitBeside | None = None
         if isinstance(spec.learner, SimulationError):
             self._fits = FitBeside(first_simulation())
+        elif isinstance(spec.learner, GaussNewton) and not spec.learner.refit_every:
+            self._fits = FitBeside(self._state.fit_request())
         elif self._state.steps.evidence is not None:
             self._fits = FitBeside(first_evidence())
         self._waits = deadline is None
@@ -294,7 +296,7 @@ class Explorer(SavedExplored):
             If all steps are done.
         """
         x, now = self._measured(state), seconds(time)
-        with uninterrupted(), self._lock:
+        with uninterrupted(), self._lock, self._timed(0):
             self._require_step()
             if not self._is_usable(x):
                 self._wait()
@@ -360,7 +362,7 @@ class Explorer(SavedExplored):
         """
         x, now = self._measured(state), seconds(time)
         u = None if applied is None else finite("applied", applied, self.spec.system.n_inputs)
-        with uninterrupted(), self._lock:
+        with uninterrupted(), self._lock, self._timed(1):
             self._require_step()
             self._wait()
             self._told = np.array(state, dtype=float), now
@@ -406,7 +408,7 @@ class Explorer(SavedExplored):
         Without a deadline a fit is waited for when the next one is due.
         """
         state, learner, rows = self._state, self.spec.learner, self._state.run.rows
-        assert isinstance(learner, SimulationError | Conditioning)
+        assert isinstance(learner, SimulationError | Conditioning | GaussNewton)
         due = max(learner.first_rows, (1.0 + learner.growth) * max(state.run.fitted, fits.rows))
         if fits.is_ready or (fits.is_running and self._waits and rows >= due):
             found = fits.take()

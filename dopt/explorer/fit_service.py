@@ -6,6 +6,7 @@ import contextlib
 import os
 import pickle
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +14,29 @@ from dopt.errors import SpecificationError
 from dopt.explorer.refit import Found
 from dopt.fitting.fit import fit
 from dopt.kernel.evidence import Request, fit_rows
+from dopt.kernel.learners import gauss_newton
 from dopt.log import Log
 from dopt.systems.plant import Plant
 from dopt.types import Array
 
 WEIGHTS = (30.0, 10.0, 3.0, 1.0)
 """Weights s that the fits try (:func:`dopt.fit`)."""
+
+
+MOST_STEPS = 50
+"""Steps of a fit of a network to its samples."""
+
+
+def _answer(request: Any) -> Found | Array:
+    """Return what a fit finds, for a :data:`dopt.explorer.refit.FitRequest`."""
+    if isinstance(request, Request):
+        return fit_rows(request)
+    if isinstance(request[0], Plant):
+        return _found(*request)
+    problem: gauss_newton.Problem = request[0]
+    theta: Array = request[1]
+    gauss_newton.fit(problem, theta, MOST_STEPS)
+    return theta
 
 
 def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
@@ -43,9 +61,7 @@ def serve() -> None:
         except EOFError:
             return
         try:
-            answer: Found | Array | str = (
-                fit_rows(request) if isinstance(request, Request) else _found(*request)
-            )
+            answer: Found | Array | str = _answer(request)
         except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
             answer = str(error)
         try:

@@ -29,9 +29,11 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     from dopt.kernel.evidence import Request  # which loads the compiler
+    from dopt.kernel.learners.gauss_newton import Problem
 
-    FitRequest = tuple[Plant, Log, int, int] | Request
-    """What a fit is given: plant, log, units of the network, seed; or samples of processes."""
+    FitRequest = tuple[Plant, Log, int, int] | Request | tuple[Problem, Array]
+    """What a fit is given: plant, log, units of the network, seed; samples of processes; or a
+    network with its samples, and the parameters to begin with."""
 
 
 class Recording:

@@ -6,7 +6,8 @@ import functools
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -360,6 +361,7 @@ class SavedExplored(Explored):
         self._savers: dict[str | None, ExplorationSaver] = {}
         weakref.finalize(self, _close, self._savers)
         self._begun = time.perf_counter(), time.process_time()
+        self._times = np.full((2, spec.system.horizon), np.nan)  # µs of ask() and tell()
 
     def save(self, url: str | None = None, test: Run | None = None) -> bool:
         """Store the exploration so far as a trial in the results database of the launches.
@@ -407,7 +409,7 @@ class SavedExplored(Explored):
         with self._lock:
             states, inputs, errors = self.states, self.inputs, self.errors
             parameters, excess = self.parameters.copy(), self._state.excess[: self.n_steps].copy()
-            counts = self.counts
+            counts, (asked, told) = self.counts, self._times[:, : self.n_steps].copy()
         at = _diverged_at(errors, parameters)
         n = len(errors) if at is None else at
         errors[n:] = np.nan
@@ -421,8 +423,8 @@ class SavedExplored(Explored):
         return TrialResult(
             loss=errors,
             reachable_loss=unknown,
-            plan_us=unknown,
-            learn_us=unknown,
+            plan_us=asked,
+            learn_us=told,
             evaluate_us=unknown,
             states=states,
             inputs=inputs,
@@ -432,6 +434,14 @@ class SavedExplored(Explored):
             cpu_seconds=time.process_time() - self._begun[1],
             assessments=tested,
         )
+
+    @contextmanager
+    def _timed(self, row: int) -> Iterator[None]:
+        """Note how long a call of :meth:`ask`, or of :meth:`tell`, takes in this step."""
+        t, began = self.n_steps, time.perf_counter()
+        yield
+        if t < self._times.shape[1]:
+            self._times[row, t] = 1e6 * (time.perf_counter() - began)
 
     def _tested(self, test: object, n: int, parameters: Array) -> Assessment:
         if not isinstance(test, tuple | list) or len(test) != 2:

@@ -43,7 +43,7 @@ from dopt.errors import ExplorationError
 from dopt.explorer.journal import Event, is_event
 from dopt.explorer.refit import Found, Recording
 from dopt.explorer.signs import Signs
-from dopt.learning import SimulationError
+from dopt.learning import GaussNewton, SimulationError
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.scaled import scaled, scaled_trial
@@ -55,6 +55,7 @@ from dopt.types import Array
 if TYPE_CHECKING:
     from dopt.explorer.refit import FitRequest
     from dopt.kernel.evidence import Evidence  # which loads the compiler
+    from dopt.kernel.structs import Trial
 
 REMEMBERED = 1000
 """Inputs that are kept for another delay or lag; what was before the first is taken for it."""
@@ -329,10 +330,27 @@ class ExplorerState:
         """Return what a fit beside the exploration is given."""
         if self.steps.evidence is not None:
             return self.steps.evidence.request()
+        if isinstance(self.spec.learner, GaussNewton):
+            return self._samples(self.spec.learner)
         assert isinstance(self.spec.model, MLP)
         assert isinstance(self.spec.system, ExploredPlant)
         plant = self.spec.system.plant
         return plant, self.run.log(plant), self.spec.model.width, self.spec.seed
+
+    @property
+    def _trial(self) -> Trial:
+        trial: Trial = self.steps.trial  # type: ignore[attr-defined]  # of a learner of the kernel
+        return trial
+
+    def _samples(self, learner: GaussNewton) -> FitRequest:
+        from dopt.kernel.learners.gauss_newton import Problem
+
+        trial = self._trial
+        features, targets = trial.state.window_features, trial.state.window_targets
+        n = min(max(self.done, 1), features.shape[1])  # before the first step it is compiled
+        ridge = trial.algorithm.learner[0] * learner.noise_variance
+        kept = features[:, :n].copy(), targets[:, :n].copy()
+        return Problem(trial.network, trial.state.prior, ridge, *kept), trial.state.theta.copy()
 
     def refitted(self, found: Found | Array, rows: int) -> Event:
         """Return the event of a fit to so many rows that comes into force."""
@@ -348,6 +366,9 @@ class ExplorerState:
             numbers = np.array(event["refit"]).reshape(self.steps.evidence.numbers.shape)
             self.steps.evidence.take(numbers, event["rows"])
             return
+        if isinstance(self.spec.learner, GaussNewton):
+            self.steps.replace(np.array(event["refit"]), self._trial.plant.parameters)
+            return
         assert isinstance(self.system, ExploredPlant)
         self.system = dataclasses.replace(self.system, fitted=tuple(event["fitted"]))
         self._scaled = scaled(self.system)
@@ -360,9 +381,12 @@ class ExplorerState:
         follows = self.present is not None and self.done < self.spec.system.horizon
         whole = is_event(event, len(self._measured), self.spec.system.n_inputs)
         if "refit" in event:
-            evidence, fits = self.steps.evidence, isinstance(self.spec.learner, SimulationError)
+            evidence, learner = self.steps.evidence, self.spec.learner
+            fits = isinstance(learner, SimulationError | GaussNewton)
             sizes = len(self.steps.parameters), len(self.system.parameters) + 2
-            if evidence is not None:
+            if isinstance(learner, GaussNewton):
+                sizes = len(self.steps.parameters), 0
+            elif evidence is not None:
                 fits, sizes = True, (evidence.numbers.size, 0)
             whole &= fits and (len(event["refit"]), len(event["fitted"])) == sizes
         return whole and (follows or not needs_state)

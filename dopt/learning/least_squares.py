@@ -47,6 +47,9 @@ from dopt.systems.base import System
 from dopt.trial_view import TrialView
 from dopt.types import Array
 
+NEVER = 2**31
+"""Steps that no trial has."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecursiveLeastSquares(Learner):
@@ -118,7 +121,9 @@ class GaussNewton(InformationLearner):
     capacity : int
         Number of newest samples that are fitted.
     refit_every : int
-        Steps from one fit to the next.
+        Steps from one fit to the next. With 0 samples are filtered alone, in 60 µs a step for 386
+        parameters, and a process beside an exploration (:class:`dopt.Explorer`) fits all of them,
+        again whenever there are a quarter more. What it finds replaces θ, and M goes on.
     steps : int
         Gauss-Newton steps of a fit.
     overshoot : str
@@ -132,7 +137,10 @@ class GaussNewton(InformationLearner):
     reads_inputs: ClassVar[bool] = True
 
     capacity: int = parameter(10_000, "samples", "positive")
-    refit_every: int = parameter(1, "steps", "positive")
+    first_rows: ClassVar[int] = 20
+    growth: ClassVar[float] = 0.25
+
+    refit_every: int = parameter(1, "steps", "nonnegative")
     steps: int = parameter(1, "steps", "positive")
     overshoot: str = parameter("stay", choices=("stay", "damp"), added=True)
 
@@ -140,7 +148,8 @@ class GaussNewton(InformationLearner):
         return min(self.capacity, horizon)
 
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
-        fit = float(self.refit_every), float(self.steps), float(self.overshoot == "damp")
+        every = self.refit_every or NEVER
+        fit = float(every), float(self.steps), float(self.overshoot == "damp")
         return regularization, self.noise_variance, *fit
 
 

@@ -130,9 +130,10 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
             "the two together",
             "were",
         )
-    if isinstance(model, Ensemble) and isinstance(learner, GaussNewton) and learner.refit_every > 1:
+    fits = not isinstance(learner, GaussNewton) or learner.refit_every == 1
+    if isinstance(model, Ensemble) and not fits:
         # a filter between two fits would keep the M of one network
-        every = f"learner.refit_every {learner.refit_every}"
+        every = f"learner.refit_every {getattr(learner, 'refit_every', 1)}"
         raise mismatch(f"model '{model.name}'", "learner.refit_every 1", every)
 
 

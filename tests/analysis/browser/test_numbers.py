@@ -84,6 +84,11 @@ def test_a_width_and_a_condition_choose_other_configurations(client: TestClient)
     assert "fits no stored configuration" in refused.json()["error"]
 
 
+_TIMES = """
+SELECT plan_us, learn_us FROM step JOIN trial USING (trial_id) WHERE trial_key = :trial_key
+"""
+
+
 def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> None:
     (config,) = [c for c in reader.configs() if (c.env, c.policy) == ("cartpole", "d_optimal")]
     row = reader.trials(config.config_key)[1]
@@ -101,6 +106,11 @@ def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> Non
     assert len(frequency) == len(density) == 19
     assert 0.4 < arrays["spectrum"]["eigenfrequency"] < 0.7
     assert len(arrays["phase"]["x"]) >= 41
+    us = np.array([*map(tuple, reader.rows(_TIMES, trial_key=row.trial_key))]).sum(axis=1)
+    found = arrays["durations"]
+    edges = np.array([*found["us"], found["us"][-1] * 10**0.1]) / 10**0.05
+    assert found["steps"] == np.histogram(us, edges)[0].tolist()
+    np.testing.assert_allclose(found["quantiles"], np.quantile(us, [0.5, 0.99, 1.0]))
 
 
 def test_a_trial_names_its_unusual_settings(

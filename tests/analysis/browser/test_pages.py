@@ -50,7 +50,7 @@ def test_from_the_grid_to_a_trial(page: Page) -> None:
     page.locator("tbody tr", has_text="diverged").get_by_role("link").click()
     expect(page.get_by_role("heading", level=1)).to_have_text("cartpole, random, seed 2")
     page.wait_for_selector("#charts[data-drawn]")
-    expect(page.locator("#charts canvas")).to_have_count(4)
+    expect(page.locator("#charts canvas")).to_have_count(5)
     expect(page.locator("#spectrum-note")).to_contain_text("eigenfrequency")
     page.get_by_role("link", name="all seeds of this configuration").click()
     expect(page.locator("tbody tr")).to_have_count(4)
@@ -65,7 +65,7 @@ def test_states_with_bounds_have_a_chart(show: Callable[[str], Page], tmp_path: 
     page.wait_for_selector("#charts[data-drawn]")
     expect(page.locator("#states canvas")).to_have_count(1)
     expect(page.locator("#states-legend li")).to_have_count(2)
-    expect(page.locator("#charts canvas")).to_have_count(5)
+    expect(page.locator("#charts canvas")).to_have_count(6)
 
 
 def test_curves_follow_the_controls(page: Page) -> None:

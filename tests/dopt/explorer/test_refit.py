@@ -27,6 +27,7 @@ from dopt.systems.plant import ExploredPlant
 from dopt.systems.real import Flight
 from dopt.types import Array
 from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, motor_acceleration
+from tests.waiting import until
 
 DT = MOTOR.dt
 SMALL = {"name": "mlp", "depth": 1, "width": 6}
@@ -39,10 +40,10 @@ PLANT = dataclasses.replace(
 
 
 class Rig:
-    """The motor in continuous time behind a delay of 1.5 samples and a lag of 30 ms."""
+    """The motor in continuous time behind a delay, in samples, and a lag [s]."""
 
-    def __init__(self) -> None:
-        self._flight, self.x, self.time = Flight(1.5, 0.03, DT, 1), np.array([0.1, 0.0]), 0.0
+    def __init__(self, delay: float = 1.5, lag: float = 0.03) -> None:
+        self._flight, self.x, self.time = Flight(delay, lag, DT, 1), np.array([0.1, 0.0]), 0.0
 
     def step(self, u: Array) -> Array:
         acting = self._flight.depart(u)
@@ -89,6 +90,28 @@ def test_a_journal_ends_at_the_same_parameters_bit_for_bit(tmp_path: Path) -> No
         np.testing.assert_array_equal(again.ask(rig.x, rig.time), planned)
         drive(again, rig, 100)
         assert again.counts["refits"] > before[2]["refits"]
+
+
+def test_a_network_is_fitted_beside_while_samples_are_filtered(tmp_path: Path) -> None:
+    """Along the run it is better than by the filter alone."""
+    missed = {}
+    for every in (0, 400):
+        learner = {"name": "gauss_newton", "refit_every": every}
+        given: dict[str, Any] = {"learner": learner, "model": "mlp", "seed": 2}
+        with explorer(MOTOR, journal=tmp_path / f"{every}.jsonl", **given) as one:
+            rig = Rig(0.0, 0.0)
+            for _ in range(350):
+                drive(one, rig, 1)
+                until(lambda fits=one._fits: not fits or fits.is_ready or not fits.is_running)
+            assert (one.counts["refits"] >= 3) == (every == 0)
+            at = one.states[:350]
+            wrong = one.predict(at)[:, 0] - np.array([motor_acceleration(x) for x in at])
+            missed[every] = np.sqrt(np.mean(wrong**2))
+            before = one.counts["refits"], one.parameters.copy()
+        with explorer(MOTOR, journal=tmp_path / f"{every}.jsonl", **given) as again:
+            assert again.counts["refits"] == before[0]
+            np.testing.assert_array_equal(again.parameters, before[1])
+    assert missed[0] < 0.7 * missed[400]
 
 
 KILLED = """

@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -59,6 +60,20 @@ def test_it_runs_until_it_is_closed(url: str, run: Explorer) -> None:
     assert state() == "running, 40 of 300 steps"
     run.close()
     assert state() == "done, 40 of 300 steps"
+
+
+def test_what_ask_and_tell_took_is_stored(url: str, run: Explorer) -> None:
+    """Each is shorter than the whole exploration, and longer than a clock's step."""
+    begun = time.perf_counter()
+    drive(run, 10)
+    whole = 1e6 * (time.perf_counter() - begun)
+    run.save(url)
+    with Reader.open(url) as reader:
+        rows = [*map(tuple, reader.rows("SELECT plan_us, learn_us FROM step ORDER BY t"))]
+    times = np.array(rows, dtype=float)[-10:]
+    assert times.shape == (10, 2)
+    assert (times > 0.1).all()
+    assert times.sum() < whole
 
 
 def test_an_exploration_lives_between_two_saves(

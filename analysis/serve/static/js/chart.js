@@ -98,7 +98,7 @@ export function nameLines(place, lines) {
  * @param {HTMLElement} place
  * @param {object} spec
  *   x: positions; title: (index) => text of the cursor; label: [x, y]; log: [x, y];
- *   lines: label, colour, dash, line_width, values; low, high (a band); points (faint); hidden; silent;
+ *   lines: label, colour, dash, line_width, values; low, high (a band); points (faint); paths (filled); hidden; silent;
  *   range: limits of y; height; axes: options of uPlot for x and y; zoom; hooks: of uPlot
  */
 export function draw(place, spec) {
@@ -111,7 +111,8 @@ export function draw(place, spec) {
   };
   for (const line of spec.lines) {
     const [show, stroke, width] = [!line.hidden, () => ink(line.colour), 1.25 * line.line_width];
-    add(line.values, show, { stroke, width, dash: line.dash.map((piece) => piece * line.line_width) });
+    const bars = line.paths ? { paths: line.paths, fill: stroke } : {};
+    add(line.values, show, { stroke, width, dash: line.dash.map((piece) => piece * line.line_width), ...bars });
     if (line.points) add(line.points, show, { points: { show: true, size: 3, width: 0, stroke: "transparent", fill: () => `${ink(line.colour)}4d` } });
     if (!line.low) continue;
     bands.push({ series: [series.length + 1, series.length], fill: () => `${ink(line.colour)}2b` });

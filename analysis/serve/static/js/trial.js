@@ -71,6 +71,22 @@ function drawSpectrum(found) {
     : "The linearised system does not oscillate: there is no eigenfrequency.";
 }
 
+/** Draw how many steps took how long: the plan and what was learned, or ask() and tell(). */
+function drawDurations(found) {
+  const { us, steps, quantiles } = found.durations;
+  const note = part("durations-note");
+  if (!us.length) {
+    note.textContent = "No times are stored.";
+    return;
+  }
+  const x = us.map((value) => value / 1000);
+  const paths = uPlot.paths.bars({ size: [1, 100] });
+  const bars = line(found, "steps", steps, 0, 1, { paths });
+  draw(part("durations"), { x, lines: [bars], label: ["time [ms]", "steps"], log: [true, false], title: (i) => `${numeral(x[i], 2)} ms` });
+  const [median, most, longest] = quantiles.map((value) => `${numeral(value / 1000, 2)} ms`);
+  note.textContent = `Planning and learning: median ${median}, 99 % below ${most}, longest ${longest}.`;
+}
+
 /** Vertical lines at the eigenfrequency and its third harmonic. */
 function mark({ ctx, bbox, valToPos }, frequency) {
   ctx.save();
@@ -140,6 +156,7 @@ async function load() {
     part("inputs-note").textContent = `${names}: γ = ${numeral(found.gamma, 3)}.`;
     if (part("states")) drawTimes("states", found, found.bounded, 1);
     drawSpectrum(found);
+    drawDurations(found);
     if (found.phase) drawPhase(found);
     charts.dataset.drawn = String(found.t.length);
   } catch (error) {
