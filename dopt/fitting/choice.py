@@ -16,8 +16,7 @@ move the parameters by
     δ = (I + Σ JᵀJ)⁻¹ (Σ Jᵀe - (p - p₀)),
 
 and by error is taken the one after which the pool's Σ ‖e - J δ‖² is least. Where the model cannot
-fit everything, log det takes extremes, and this what stands for the pool. The constants may be less
-certain.
+fit everything, log det takes extremes; by error the constants become less certain.
 
 References: V. Fedorov, "Theory of optimal experiments" (1972); G. Nemhauser, L. Wolsey and
 M. Fisher, "An analysis of approximations for maximizing submodular set functions" (1978).
