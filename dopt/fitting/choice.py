@@ -10,6 +10,14 @@ over what was taken before and it. What the unknown initial state of a recorded 
 is taken out of J; a signal begins at a state that is given. Without fits in between, the sum is at
 least 1 - 1/e of the largest of as many candidates, because log det is submodular.
 
+Logs have the residuals e of the whole pool, too. Candidate j, with what was taken before, would
+move the parameters by
+
+    δ = (I + Σ JᵀJ)⁻¹ (Σ Jᵀe - (p - p₀)),
+
+and by error is taken the one after which the pool's Σ ‖e - J δ‖² is least. Where the model cannot
+fit everything, log det takes extremes; by error the constants become less certain.
+
 References: V. Fedorov, "Theory of optimal experiments" (1972); G. Nemhauser, L. Wolsey and
 M. Fisher, "An analysis of approximations for maximizing submodular set functions" (1978).
 """
@@ -45,7 +53,7 @@ from dopt.log import Log, Piece
 from dopt.systems.plant import Plant, Unknown, first_guess
 from dopt.types import Array, Integers
 
-ORDERS = ("information", "random")
+ORDERS = ("information", "error", "random")
 
 LEAST = 0.1
 """Least residuals of the constants that a network is weighed by, in deviations."""
@@ -149,8 +157,9 @@ def choose(
         Candidates that are taken already.
     refit : bool
         Fit the model to what was taken after each choice; never to signals, which have not run.
-    by : {"information", "random"}
-        ``random`` takes them in an order drawn by the seed, for comparison.
+    by : {"information", "error", "random"}
+        What raises most log det; or, of logs, what lowers most the error of the whole pool, for
+        predictions of a model that cannot fit everything; or an order drawn by the seed.
     width : int
         Units of the network beside the known part; 0 for none.
     weight : float
@@ -166,11 +175,17 @@ def choose(
     Raises
     ------
     SpecificationError
-        If the pool is no pool of the plant, or holds fewer than k candidates.
+        If the pool is no pool of the plant, or holds fewer than k candidates, or if signals are to
+        be taken by error.
     """
     instance("plant", plant, Plant | Fitted, "a dopt.Plant or a result of dopt.fit")
     if by not in ORDERS:
         raise unknown_name("order in 'by'", by, ORDERS)
+    if by == "error" and start is not None:
+        raise SpecificationError(
+            "by is 'error' with signals, but logs, in which the outputs were measured, are "
+            "expected: leave by out."
+        )
     declared = plant.plant if isinstance(plant, Fitted) else plant
     if start is not None:
         start = finite("start", start, len(declared.states))
@@ -194,7 +209,7 @@ def choose(
         if refit and chosen:
             search.fit(chosen)
         if step == 0 or refit:
-            base, each = search.information()
+            base, each, slopes = search.information()
             before, whole_pool = _log_det(base), _log_det(base + each.sum(axis=0))
         M = base + each[chosen].sum(axis=0)
         if step == 0 or refit:
@@ -203,9 +218,11 @@ def choose(
             shares.append((_log_det(M) - before) / max(whole_pool - before, 1e-300))
         if step < k:
             more = _log_det(M + each) - _log_det(M)
-            more[chosen] = -np.inf
+            known = slopes[0] + slopes[1:][chosen].sum(axis=0)
+            worth = _falls(M, each, known, slopes[1:]) if by == "error" else more
+            worth[chosen] = -np.inf
             drawn = (int(j) for j in order if j not in chosen)
-            chosen.append(int(np.argmax(more)) if by == "information" else next(drawn))
+            chosen.append(next(drawn) if by == "random" else int(np.argmax(worth)))
             gains.append(float(more[chosen[-1]]))
     new = tuple(chosen[first:])
     found = tuple(logs[i] for i in new if start is None), tuple(places[i] for i in new)
@@ -214,6 +231,15 @@ def choose(
 
 def _log_det(M: Array) -> Any:
     return np.linalg.slogdet(M)[1]
+
+
+def _falls(M: Array, each: Array, slope: Array, slopes: Array) -> Array:
+    """Return by how much the pool's squares fall with each candidate, (n,), to first order in J."""
+    steps = np.linalg.solve(M + each, (slope + slopes)[:, :, None])[:, :, 0]
+    falls: Array = 2.0 * steps @ slopes.sum(axis=0) - np.sum(
+        steps @ each.sum(axis=0) * steps, axis=1
+    )
+    return falls
 
 
 def _signals(plant: Plant, pool: Any, seconds: float | None) -> tuple[list[Log], list[str]]:
@@ -383,19 +409,22 @@ class _Search:
             self.p = solve(simulator, found.windows, p, self.s, scale=found.scale).p
         self._settle()
 
-    def information(self) -> tuple[Array, Array]:
-        """Return I and the information of what was known, (q, q), and of each, (n, q, q)."""
+    def information(self) -> tuple[Array, Array, Array]:
+        """Return JᵀJ of what was known with I, (q, q), of each, (n, q, q), and Jᵀe, (n + 1, q)."""
         q, simulator = self.model.q, Simulator(self.model, self.data)
         out, windows = np.zeros((self.n + 1, q, q)), self.windows.where(self.free)
         weights, owners = np.full(len(windows.rows), self.s**-2), self.owners[self.free] + 1
-        parts = simulator.linear(self.p, windows, weights, owners=owners).parts
-        out[: len(parts)] = parts
+        linear = simulator.linear(self.p, windows, weights, scores=True, owners=owners)
+        out[: len(linear.parts)] = linear.parts
+        slopes = np.zeros((self.n + 1, q))
+        np.add.at(slopes, owners, linear.scores)  # type: ignore[arg-type]  # asked for
+        slopes[0] -= self.p - self.model.prior
         for i in np.flatnonzero(~self.free):
             (first, last), start = self.windows.rows[i], self.windows.starts[i]
             _, S = simulator.slopes(self.p, first, last, start)
             R = S[:, self.model.structure.measured, :q] / (self.s * self.data.deviations[:, None])
             out[self.owners[i] + 1] = np.einsum("tnq,tnr->qr", R, R) if np.isfinite(R).all() else 0
-        return np.eye(q) + out[0], out[1:]
+        return np.eye(q) + out[0], out[1:], slopes
 
 
 def _joined(a: Data, b: Data) -> Data:

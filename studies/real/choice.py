@@ -1,4 +1,4 @@
-"""``python -m studies.real.choice``: segments of the disk's run by D-optimal choice, and at random.
+"""``python -m studies.real.choice``: segments of the disk's run by choice, and at random.
 
 A seed draws the block of 5,000 samples that is left out, 200 segments of one second of the others,
 the first segment, and a random order of the rest. After each segment the model is fitted to all
@@ -19,7 +19,7 @@ import dopt
 from analysis import outputs
 from analysis.style import within
 from analysis.tables.rendering import TextTable
-from dopt.fitting.choice import State, segments_of
+from dopt.fitting.choice import ORDERS, State, segments_of
 from dopt.fitting.model import data_of
 from dopt.fitting.problem import Simulator, predicted
 from dopt.fitting.simulation import Data
@@ -33,6 +33,9 @@ STORED = Path(__file__).with_name("choice.csv")
 PLANT = dataclasses.replace(CASES["disk"].plant, delay=0.025)
 """The disk with its delay of one sample: six constants, and 47 parameters with eight units."""
 
+FIRST = 200
+"""First seed: the criterion was chosen on others."""
+
 WIDTHS = (0, 8)
 POOL, MOST = 200, 30
 FACTOR = 1.15
@@ -41,7 +44,7 @@ FACTOR = 1.15
 AFTER = (2, 4, 10, 20, 30)
 """Numbers of segments after which errors are compared."""
 
-HELP = "segments of the disk's run by D-optimal choice, beside a random one"
+HELP = "segments of the disk's run by choice, beside a random one"
 
 
 @answered
@@ -50,21 +53,28 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = Parser(prog="python -m studies.real.choice", description=HELP)
     parser.add_argument("--data", type=path("--data"), help="folder with disk_train.csv.gz")
     parser.add_argument("--seeds", type=integer("--seeds"), default=20, help="number of seeds (20)")
+    orders = [by for by in ORDERS if by != "random"]
+    parser.add_argument("--by", choices=orders, default="error", help="what chooses (error)")
     parser.add_argument("--out", type=path("--out"), default="real", help="folder (real/)")
     options = parser.read(sys.argv[1:] if words is None else words)
     logs = [
         dopt.Log.for_plant(part, PLANT, CASES["disk"].columns)
         for part in parts("disk", options.data).values()
     ]
-    seeds = range(100, 100 + options.seeds)
-    rows = pd.concat([curves(logs, seed, width) for seed in seeds for width in WIDTHS])
+    seeds = range(FIRST, FIRST + options.seeds)
+    rows = pd.concat([curves(logs, s, width, options.by) for s in seeds for width in WIDTHS])
     tell(sys.stdout, table(rows).markdown() + "\n")
     outputs.write_table(rows, options.out, "choice")
     return 0
 
 
 def curves(
-    logs: Sequence[dopt.Log], seed: int, width: int, pool: int = POOL, most: int = MOST
+    logs: Sequence[dopt.Log],
+    seed: int,
+    width: int,
+    order: str = "error",
+    pool: int = POOL,
+    most: int = MOST,
 ) -> pd.DataFrame:
     """Return the errors [rad] after each number of segments, chosen and at random, and of all."""
     rng = np.random.default_rng(seed)
@@ -77,7 +87,7 @@ def curves(
     whole = dopt.choose(PLANT, some, 0, taken=range(pool), **how)  # type: ignore[arg-type]  # of several types
     chosen, drawn = (
         dopt.choose(PLANT, some, most - 1, taken=[0], by=by, **how).states  # type: ignore[arg-type]  # the same
-        for by in ("information", "random")
+        for by in (order, "random")
     )
     return pd.DataFrame(
         {

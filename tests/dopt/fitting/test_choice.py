@@ -13,7 +13,7 @@ from scipy.linalg import expm
 import dopt
 from dopt.errors import SpecificationError
 from dopt.fitting.choice import Choice
-from dopt.log import Piece
+from dopt.log import Log, Piece
 from dopt.types import Array
 from tests.dopt.fitting.test_fit import declared, run
 from tests.paths import ROOT
@@ -142,15 +142,50 @@ def test_what_an_unknown_initial_state_explains_does_not_count(seed: int) -> Non
     assert [log is logs[i] for i, log in zip(found.indices, found.logs, strict=True)] == [True] * 4
 
 
+def by_error(pool: list[tuple[Array, Array]], k: int) -> list[int]:
+    """Return the greedy choice, each candidate by a fit of a linear model and all its residuals."""
+    taken: list[int] = []
+
+    def left(some: list[int]) -> float:
+        rows = [np.eye(3), *(pool[i][0] for i in some)]
+        values = [np.zeros(3), *(pool[i][1] for i in some)]
+        move = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0]
+        return sum(float(np.sum((e - R @ move) ** 2)) for R, e in pool)
+
+    for _ in range(k):
+        rest = [j for j in range(len(pool)) if j not in taken]
+        taken.append(min(rest, key=lambda j: left([*taken, j])))
+    return taken
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_lowers_the_error_of_the_pool_is_taken(seed: int) -> None:
+    """With other constants for each log, so that none of them stands for all."""
+    rng, logs, pool = np.random.default_rng(seed), [], []
+    for u in pool_of_signals(seed):
+        constants, start = GUESS + rng.normal(size=3) * SPREADS / 3, rng.normal(size=2)
+        x = response(constants, start, u[:, 0])[:, :1] + rng.normal(size=(len(u), 1)) * NOISE
+        logs.append(Log.of_pieces(["angle"], ["voltage"], [Piece(np.arange(len(u)) * DT, x, u)]))
+        R, X = sensitivities(u[3:36, 0], start)
+        e = (x[3:36, 0] - response(GUESS, start, u[3:36, 0])[:, 0]) / NOISE
+        start = start + np.linalg.pinv(X) @ e  # which fits best
+        R, P = sensitivities(u[3:36, 0], start)[0], np.eye(len(X)) - X @ np.linalg.pinv(X)
+        pool.append((P @ R, P @ e))
+    found = dopt.choose(motor(), logs, 4, by="error", width=0, refit=False, window=32 * DT)
+    assert found.indices == tuple(by_error(pool, 4))
+
+
+@pytest.mark.parametrize("by", ["error", "information"])
 @pytest.mark.parametrize("width", [0, 4])
 @pytest.mark.parametrize("refit", [False, True])
-def test_units_do_not_matter(width: int, refit: bool) -> None:
+def test_units_do_not_matter(width: int, refit: bool, by: str) -> None:
     results = []
     for unit, angle in ((1.0, 1.0), (1000.0, 1.0), (0.01, 50.0)):
         logs = logs_of_motor(1, angle)
         results.append(
             dopt.choose(
-                motor(unit, angle), logs, 3, width=width, refit=refit, window=0.5, taken=[2]
+                *(motor(unit, angle), logs, 3),
+                **{"width": width, "refit": refit, "window": 0.5, "taken": [2], "by": by},  # type: ignore[arg-type]  # of several types
             )
         )
     first = results[0]
@@ -240,6 +275,7 @@ LOGS = logs_of_motor(0)
         ({"start": [0.0]}, r"start has the shape \(1,\)"),
         ({"start": [0, 0], "pool": [np.zeros((9, 2))]}, r"signal 0 has the shape \(9, 2\)"),
         ({"start": [0, 0], "seconds": 1.0}, "leave seconds out"),
+        ({"start": [0, 0], "by": "error"}, "by is 'error' with signals, but logs, in"),
         ({"start": [0, 0], "plant": motor(measured={})}, "declare 'measured'"),
         (
             {"plant": motor(constants=dict(zip(("gain", "damping", "bias"), GUESS, strict=True)))},
