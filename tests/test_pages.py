@@ -1,16 +1,125 @@
-"""The page of the database is true: its queries answer, its tables and views are all there are."""
+"""Pages for readers: their links, their tables, the README, and the page of the database."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
+import shutil
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from orchestrate.store import Reader
 from orchestrate.store.schema import SCHEMA_VERSION, VIEWS, metadata
 from tests.analysis.synthetic import fill, make_grid
-from tests.pages import PAGES, blocks
+from tests.pages import GENERATED, PAGES, anchors, blocks, links
+from tests.paths import ROOT, loaded
 from tests.test_docs import SHORT, TASK
+
+MADE = {"docker/secrets"}
+"""Paths that a command of a page writes."""
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_to_a_file_and_a_heading(page: str) -> None:
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target.read_text()), link
+
+
+def test_every_file_that_a_page_names_exists() -> None:
+    folders = "analysis|benchmarks|conf|docker|docs|dopt|orchestrate|studies|tests"
+    for page, text in PAGES.items():
+        for path in re.findall(rf"`((?:{folders})/[\w./-]+)`", text):
+            if page not in GENERATED and path not in MADE:
+                assert (ROOT / path).exists(), f"{page}: {path}"
+
+
+def test_no_page_says_that_it_is_out_of_date() -> None:
+    for page, text in PAGES.items():
+        assert not re.search(r"out of date|outdated|no longer true|earlier version of", text), page
+
+
+def tables(docs: Path) -> ModuleType:
+    """Load ``docs/tables.py`` for a folder of pages and CSV files."""
+    module = loaded(ROOT / "docs/tables.py")
+    module.DOCS = docs  # type: ignore[attr-defined]
+    return module
+
+
+def test_the_pages_have_the_tables_of_their_files() -> None:
+    assert tables(ROOT / "docs").main(check=True) == 0
+
+
+def test_every_table_stands_on_a_page() -> None:
+    made = tables(ROOT / "docs")
+    text = "".join((ROOT / "docs" / page).read_text() for page in made.PAGES)
+    assert set(made.TABLES) == set(re.findall(r"<!-- table: (\w+) -->", text))
+    assert text.count("<!-- table: ") == text.count("<!-- end -->")
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """Copy the pages and CSV files, with the README beside them."""
+    shutil.copy(ROOT / "README.md", tmp_path)
+    for path in (ROOT / "docs").rglob("*"):
+        if path.suffix in {".csv", ".md"}:
+            copy = tmp_path / "docs" / path.relative_to(ROOT / "docs")
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, copy)
+    return tmp_path / "docs"
+
+
+def test_a_changed_number_is_noticed_and_written(
+    copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary = copied / "summary.csv"
+    first = summary.read_text().splitlines()[1].split(",")[3]
+    summary.write_text(summary.read_text().replace(first, "7.5"))
+    assert tables(copied).main(check=True) == 1
+    assert "README.md differs from its sources" in capsys.readouterr().err
+    assert tables(copied).main(check=False) == 0
+    assert "7.50" in (copied / "../README.md").read_text()
+    assert tables(copied).main(check=True) == 0
+
+
+README = PAGES["README.md"]
+LONGEST = 900
+"""Words that the README may have, as ``wc -w`` counts them."""
+
+
+def test_it_is_short() -> None:
+    assert len(README.split()) <= LONGEST
+
+
+def test_its_example_runs() -> None:
+    (example,) = blocks(README, "python")
+    assert len(example.strip().splitlines()) <= 10
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        exec(compile(example, "README.md", "exec"), {})
+    loss, states, inputs = output.getvalue().strip().split(" ", 1)[0], "(501, 2)", "(500, 1)"
+    assert 0 < float(loss) < 10
+    assert output.getvalue().strip().endswith(f"{states} {inputs}")
+
+
+@pytest.mark.parametrize(
+    "part", ["docs/figure1.png", "make figures", "make test", "@inproceedings"]
+)
+def test_it_has_what_a_reader_looks_for(part: str) -> None:
+    assert part in README
+
+
+@pytest.mark.parametrize("paper", ["NeurIPS_ML4PS_2022_37", "2304.13426"])
+def test_it_cites_the_paper_and_its_successor(paper: str) -> None:
+    (entries,) = blocks(README, "bibtex")
+    assert paper in entries
+    assert README.count(paper) >= 2  # linked in the text as well
+
 
 DATABASE = "docs/database.md"
 QUERIES = [
