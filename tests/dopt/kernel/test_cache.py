@@ -30,7 +30,7 @@ from dopt.systems import SYSTEMS
 from dopt.types import CompiledFunction, Vector
 from tests.paths import ROOT, loaded
 
-MODULE = "def triple(x, out):\n    out[0] = 3.0 * x\n"
+MODULE = "A, B = 1.0, 2.0\n\ndef triple(x, out):\n    out[0] = (A + B) * x\n"
 SIGNATURE = void(float64, float64[::1])
 
 
@@ -123,10 +123,13 @@ def test_what_is_damaged_is_compiled_again_and_said(
 
 
 @pytest.mark.usefixtures("folder")
-def test_code_is_found_until_its_file_changes(triple: FunctionType, tmp_path: Path) -> None:
+def test_code_is_found_until_a_constant_of_its_file_changes(
+    triple: FunctionType, tmp_path: Path
+) -> None:
+    """The function itself stays the same, and so does what it returns."""
     assert not found(triple)
     assert found(triple)
-    assert not found(written(tmp_path / "own_triple.py", MODULE.replace("3.0 * x", "2.0 * x + x")))
+    assert not found(written(tmp_path / "own_triple.py", MODULE.replace("1.0, 2.0", "2.0, 1.0")))
 
 
 def test_a_damaged_part_is_missing_before_a_trial_asks_for_it(folder: Path) -> None:
