@@ -24,13 +24,12 @@ sys.dont_write_bytecode = False
 import shutil  # noqa: E402  all of these after the threads are set
 import signal  # noqa: E402
 import time  # noqa: E402
-import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
-from sqlalchemy import Engine, create_engine, text  # noqa: E402
+from sqlalchemy import Engine, create_engine  # noqa: E402
 from sqlalchemy.exc import OperationalError  # noqa: E402
 
 # As from a terminal: a shell starts what runs in its background with Ctrl-C ignored, and programs
@@ -121,14 +120,12 @@ def server(server_url: str) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def postgresql_url(server: Engine, server_url: str) -> Iterator[str]:
+def postgresql_url(request: pytest.FixtureRequest) -> Iterator[str]:
     """URL of a new schema on the server, dropped afterwards."""
-    schema = f"test_{uuid.uuid4().hex}"
-    with server.begin() as connection:
-        connection.execute(text(f"CREATE SCHEMA {schema}"))
-    yield f"{server_url}?options=-csearch_path%3D{schema}"
-    with server.begin() as connection:
-        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+    from tests.orchestrate.store.databases import new_schema
+
+    with new_schema(request) as url:
+        yield url
 
 
 def _no_server(reason: str) -> None:

@@ -1,12 +1,15 @@
-"""Agreement of the files that repeat a version: metadata, constraints, hooks, citation, image."""
+"""Agreement of the files that repeat a version, and of the pins with Debian's Python."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import tomllib
+from importlib import metadata
 
 import yaml
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
@@ -103,3 +106,14 @@ def test_no_command_for_pip_names_the_project_that_has_the_name_of_the_import() 
         files += [path for path in (ROOT / folder).rglob("*") if path.suffix in WRITTEN]
     assert len(files) > 300
     assert not [path for path in files if foreign.search(path.read_text(errors="replace"))]
+
+
+def test_debian_s_python_can_install_what_is_pinned() -> None:
+    """A library may ask for a later bugfix of Python 3.11 than Debian 12 has."""
+    pinned = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), flags=re.MULTILINE)
+    asked = {}
+    for name in pinned:
+        with contextlib.suppress(metadata.PackageNotFoundError):  # of an extra that is left out
+            asked[name] = str(metadata.metadata(name).json.get("requires_python", ""))
+    assert len(asked) > 100
+    assert not {name for name, versions in asked.items() if "3.11.2" not in SpecifierSet(versions)}

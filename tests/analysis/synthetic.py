@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +20,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System
 from dopt.systems.properties import eigenmode
-from orchestrate.store import LaunchRecord, RunRecord, Store
+from orchestrate.store import LaunchRecord, Reader, RunRecord, Store
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +42,15 @@ def make_spec(system: str, name: str, seed: int, **sections: Mapping[str, object
     for key, fields in sections.items():
         mapping[key] = {**mapping.get(key, {}), **fields}  # type: ignore[dict-item]
     return TrialSpec.from_mapping(mapping)
+
+
+@contextmanager
+def filled(folder: Path, specs: Sequence[TrialSpec], **options: Any) -> Iterator[Reader]:
+    """Store trials in a new database in a folder, as ``fill`` does, and read it."""
+    url = f"sqlite:///{folder}/results.db"
+    fill(url, specs, **options)
+    with Reader.open(url) as reader:
+        yield reader
 
 
 def make_grid(

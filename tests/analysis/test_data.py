@@ -32,7 +32,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Curves, NoDatabaseError, Reader
 from tests.analysis.conftest import SHORT, controlled
-from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
+from tests.analysis.synthetic import fake_result, fill, filled, make_grid, make_spec
 
 
 @pytest.fixture
@@ -283,9 +283,7 @@ def test_a_condition_tells_the_values_apart(stored: Reader) -> None:
 
 
 def test_the_condition_finds_trials_that_are_all_old(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
-    fill(url, make_grid(("pendulum",), ("d_optimal",), range(2), **BRIEF))
-    with Reader.open(url) as reader:
+    with filled(tmp_path, make_grid(("pendulum",), ("d_optimal",), range(2), **BRIEF)) as reader:
         assert information(reader, **{PATH: "accumulated"}) == ["accumulated"]
         with pytest.raises(AnalysisError, match='stored are "accumulated": choose'):
             select(reader, Filter(where={PATH: "fresh"}))
@@ -319,10 +317,10 @@ def test_a_stored_configuration_gives_back_its_trial(stored: Reader) -> None:
 
 
 def test_a_new_criterion_replaces_the_old_one_of_the_same_configuration(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
     noisy = {"learner": {"name": "ekf", "noise_variance": 0.5}}
-    fill(url, make_grid(("pendulum",), ("exact", "d_optimal"), range(2), **BRIEF, **noisy))
-    with Reader.open(url) as reader:
+    with filled(
+        tmp_path, make_grid(("pendulum",), ("exact", "d_optimal"), range(2), **BRIEF, **noisy)
+    ) as reader:
         configs = reader.configs()
     exact = next(config for config in configs if config.policy == "exact")
     content = {k: v for k, v in exact.config.items() if k != "criterion_version"}

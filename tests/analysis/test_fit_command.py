@@ -10,7 +10,7 @@ import pytest
 
 from analysis import cli
 from orchestrate.store import Reader
-from tests.dopt.fitting.test_simulation import stamps, truth
+from tests.dopt.fitting.test_fit import stamps, truth
 
 PAGE = Path(__file__).parents[2] / "docs/fitting.md"
 

@@ -329,16 +329,6 @@ def test_the_database_may_come_from_the_environment(
     assert "D-optimal" in capsys.readouterr().out
 
 
-def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DOPT_DB", "mine/x.db")
-    assert main(["summary"]) == 2
-    error = capsys.readouterr().err
-    assert "environment variable DOPT_DB" in error
-    assert "write it as sqlite:///mine/x.db." in error
-
-
 def test_missing_trials_are_refused_with_a_table(
     partial: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -410,18 +400,6 @@ def test_wrong_words_are_one_sentence(
     captured = capsys.readouterr()
     assert re.fullmatch(f"error: .*{sentence}.*[.?]\n", captured.err), captured.err
     assert captured.out == ""
-
-
-def test_a_reader_that_closes_the_output_ends_the_command(url: str) -> None:
-    command = [sys.executable, "-m", "analysis", "summary", "--db", url]
-    with subprocess.Popen(
-        command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdout.close()
-        assert "rror" not in process.stderr.read()
-    assert process.returncode == 0
 
 
 def test_no_database_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

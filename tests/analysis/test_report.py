@@ -33,7 +33,7 @@ from analysis.tables.variants import (
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
-from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
+from tests.analysis.synthetic import fake_result, fill, filled, make_grid, make_spec
 
 SHORT = {"env": {"horizon": 40}}
 SEEDS = range(6)
@@ -137,12 +137,14 @@ def test_steps_until_the_loss_stays_below_random_inputs_are_counted(
 
 
 def test_the_loss_to_reach_comes_from_the_usual_random_inputs(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/random.db"
     near = {"learner": {"window": 50}}
     specs = make_grid(("pendulum",), ("d_optimal", "random"), SEEDS, **SHORT, **ONE_SAMPLE)
     specs += make_grid(("pendulum",), ("random",), SEEDS, **SHORT, **near)
-    fill(url, specs, edit=lambda s, r: r if s.learner.window == 50 else replace(r, loss=3 * r.loss))
-    with Reader.open(url) as opened:
+    with filled(
+        tmp_path,
+        specs,
+        edit=lambda s, r: r if s.learner.window == 50 else replace(r, loss=3 * r.loss),
+    ) as opened:
         table = tabulate_group(opened, variant_groups(opened, Filter())[0])
     finals = [fake_result(make_spec("pendulum", "random", s, **SHORT)).loss[-1] for s in SEEDS]
     assert next(name for name in table.variant if "random" in name) == "random, adam"
@@ -150,9 +152,9 @@ def test_the_loss_to_reach_comes_from_the_usual_random_inputs(tmp_path: Path) ->
 
 
 def test_without_random_inputs_there_is_no_loss_to_reach(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/uniform.db"
-    fill(url, make_grid(("pendulum",), ("d_optimal", "uniform"), range(3), **SHORT))
-    with Reader.open(url) as opened:
+    with filled(
+        tmp_path, make_grid(("pendulum",), ("d_optimal", "uniform"), range(3), **SHORT)
+    ) as opened:
         table = adjust(
             [tabulate_group(opened, group) for group in variant_groups(opened, Filter())]
         )
@@ -268,9 +270,10 @@ def test_variants_may_have_different_numbers_of_seeds(tmp_path: Path) -> None:
 
 
 def test_a_report_of_one_variant_is_refused(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/one.db"
-    fill(url, make_grid(("pendulum",), ("d_optimal",), range(2), **SHORT))
-    with Reader.open(url) as reader, pytest.raises(AnalysisError, match="of another variant"):
+    with (
+        filled(tmp_path, make_grid(("pendulum",), ("d_optimal",), range(2), **SHORT)) as reader,
+        pytest.raises(AnalysisError, match="of another variant"),
+    ):
         variant_groups(reader, Filter())
 
 
@@ -339,12 +342,10 @@ def test_variants_of_one_name_are_told_apart_by_all_that_is_unusual(
     labels: list[str],
     tmp_path: Path,
 ) -> None:
-    url = f"sqlite:///{tmp_path}/values.db"
     specs = make_grid(("pendulum",), policies, range(2), **SHORT)
     for policy, sections in more:
         specs += make_grid(("pendulum",), (policy,), range(2), **SHORT, **sections)
-    fill(url, specs)
-    with Reader.open(url) as opened:
+    with filled(tmp_path, specs) as opened:
         assert [one.label for one in variant_groups(opened, Filter())[0].variants] == labels
 
 
@@ -425,11 +426,9 @@ def test_cells_of_control_are_below_their_own_steps(tmp_path: Path) -> None:
         kept = tuple(row for row in result.assessments if row.t != 10)
         return replace(result, assessments=kept)
 
-    url = f"sqlite:///{tmp_path}/stopped.db"
     task = control_task(10, 20)
     specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **task)
-    fill(url, specs, edit=stopped)
-    with Reader.open(url) as opened:
+    with filled(tmp_path, specs, edit=stopped) as opened:
         found = variant_groups(opened, Filter())
         controlled = tabulate_control_of(opened, found)
         assert controlled is not None
@@ -501,12 +500,10 @@ def test_successes_are_tested_in_pairs(tmp_path: Path) -> None:
         )
         return replace(result, assessments=tuple(rows))
 
-    url = f"sqlite:///{tmp_path}/pairs.db"
     specs = make_grid(
         ("pendulum",), ("d_optimal", "uniform"), range(8), **SHORT, **control_task(20)
     )
-    fill(url, specs, edit=decided)
-    with Reader.open(url) as opened:
+    with filled(tmp_path, specs, edit=decided) as opened:
         table = tabulate_control_of(opened, variant_groups(opened, Filter()))
     assert table is not None
     rows = table.set_index(["variant", "t"])

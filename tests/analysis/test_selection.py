@@ -37,7 +37,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from orchestrate.store import ConfigRow, Reader, TrialRow
 from tests.analysis.conftest import SHORT
-from tests.analysis.synthetic import fill, make_grid, make_spec
+from tests.analysis.synthetic import fill, filled, make_grid, make_spec
 from tests.paths import EXAMPLE, ROOT
 
 
@@ -153,14 +153,6 @@ def test_the_advice_on_a_tie_names_what_all_of_them_have() -> None:
     assert (path, values) == ("learner.name", ["ekf", "adam_window"])
 
 
-def test_a_tie_between_variants_of_one_policy_is_an_error_too() -> None:
-    mild, strong = (
-        config("pendulum", "d_optimal", policy={"regularization": value}) for value in (1e-2, 1e-4)
-    )
-    with pytest.raises(AnalysisError, match=r"policy\.regularization"):
-        choice((mild, 5), (strong, 5))
-
-
 def test_more_trials_of_the_baselines_settle_a_tie_of_the_reference() -> None:
     wide, narrow = (config("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
     random = config("pendulum", "random", **NARROW)
@@ -274,7 +266,7 @@ def test_a_digest_of_digits_is_quoted() -> None:
     assert _argument("12345678901234e5") == "'\"12345678901234e5\"'"
 
 
-def stored(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Selection:
+def selected(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Selection:
     address = f"sqlite:///{folder}/results.db"
     for specs, skipped in fillings:
         fill(address, specs, skipped=skipped)
@@ -304,7 +296,7 @@ def test_a_diverged_trial_is_finished_and_has_no_final_loss(reader: Reader) -> N
 def test_pending_trials_are_a_gap(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(6), **SHORT)
     skipped = [s for s in specs if s.policy.name == "random" and s.seed in (1, 2, 5)]
-    (gap,) = stored(tmp_path, (specs, skipped)).gaps
+    (gap,) = selected(tmp_path, (specs, skipped)).gaps
     assert (gap.env, gap.policy, gap.states) == ("pendulum", "random", "3 pending")
     assert gap.describe_seeds() == "1-2, 5"
 
@@ -312,21 +304,21 @@ def test_pending_trials_are_a_gap(tmp_path: Path) -> None:
 def test_seeds_that_only_another_policy_has_are_a_gap(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal",), range(4), **SHORT)
     specs += make_grid(("pendulum",), ("random",), range(3), **SHORT)
-    (gap,) = stored(tmp_path, (specs, [])).gaps
+    (gap,) = selected(tmp_path, (specs, [])).gaps
     assert (gap.policy, gap.seeds, gap.states) == ("random", (3,), "1 not registered")
 
 
 def test_a_policy_that_an_environment_lacks_is_a_gap_where_it_makes_sense(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal", "periodic"), range(2), **SHORT)
     specs += make_grid(("cartpole", "quadrotor"), ("d_optimal",), range(2), **SHORT)
-    (gap,) = stored(tmp_path, (specs, [])).gaps
+    (gap,) = selected(tmp_path, (specs, [])).gaps
     assert (gap.env, gap.policy, gap.seeds) == ("cartpole", "periodic", (0, 1))
 
 
 def test_other_configurations_are_noted(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(3), **SHORT)
     single = make_spec("pendulum", "random", 0, env={"gamma": 0.5, "horizon": 60})
-    selection = stored(tmp_path, (specs, []), ([single], []))
+    selection = selected(tmp_path, (specs, []), ([single], []))
     assert selection.gaps == ()
     assert len(selection.entries) == 2
     assert selection.notes == (
@@ -345,9 +337,7 @@ def test_assessments_of_different_versions_do_not_mix(
     monkeypatch.setattr(spec_config, "ASSESSMENT_VERSION", 1)
     old = make_grid(("pendulum",), policies, range(2), **task)
     assert keys.isdisjoint(one.trial_key for one in old)
-    url = f"sqlite:///{tmp_path}/versions.db"
-    fill(url, [*plain, *old, *new])
-    with Reader.open(url) as opened:
+    with filled(tmp_path, [*plain, *old, *new]) as opened:
         kept = {row.config_key for row in newest(list(opened.configs()))}
     assert kept == {one.config_key for one in (*plain, *new)}
 
@@ -357,8 +347,8 @@ def test_fingerprint_tells_outcomes_apart(tmp_path: Path, reader: Reader) -> Non
     assert whole.fingerprint() == select(reader, Filter()).fingerprint()
     assert whole.fingerprint() != whole.only(["pendulum"]).fingerprint()
     specs = make_grid(("pendulum",), ("random",), range(2), **SHORT)
-    before = stored(tmp_path, (specs, specs[:1])).fingerprint()
-    assert before != stored(tmp_path, (specs, [])).fingerprint()
+    before = selected(tmp_path, (specs, specs[:1])).fingerprint()
+    assert before != selected(tmp_path, (specs, [])).fingerprint()
 
 
 @pytest.mark.parametrize(

@@ -118,11 +118,6 @@ def test_the_bootstrap_draws_whole_trials_and_the_same_ones_each_time(
     assert (first.centre <= first.high).all()
 
 
-def test_names_stand_in_captions() -> None:
-    assert Statistic.MEAN.band == "95 % t-interval of the mean"
-    assert Statistic.IQM.band == "95 % bootstrap interval of the interquartile mean"
-
-
 @pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
 @pytest.mark.parametrize("n", [2, 3, 5, 20, 31])
 def test_the_bootstrap_equals_scipy(statistic: Statistic, n: int) -> None:

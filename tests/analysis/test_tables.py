@@ -51,10 +51,11 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Assessments, Reader
 from tests.analysis.conftest import SHORT
-from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec, simulated
+from tests.analysis.synthetic import fake_result, fill, filled, make_grid, make_spec, simulated
 from tests.dopt.trials import trial
 
 SEEDS = range(5)
+TASK = {"task": {"name": "control", "checkpoints": [20]}}
 
 
 def final(env: str, policy: str, seed: int) -> float:
@@ -360,11 +361,8 @@ def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
 
 
 def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
-    task = {"task": {"name": "control", "checkpoints": [20]}}
-    specs = make_grid(("pendulum",), ("random",), range(3), **SHORT, **task)
-    fill(url, specs)
-    with Reader.open(url) as reader:
+    specs = make_grid(("pendulum",), ("random",), range(3), **SHORT, **TASK)
+    with filled(tmp_path, specs) as reader:
         part = control_part(select(reader, Filter()))
         (entry,) = part.entries
         costs = relative_costs(reader, entry)
@@ -397,11 +395,8 @@ def overflown(measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t
 
 
 def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/lost.db"
-    task = {"task": {"name": "control", "checkpoints": [20]}}
-    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **task)
-    fill(url, specs, edit=overflown("control_cost", ("random",), (1, 3), 20))
-    with Reader.open(url) as reader:
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **TASK)
+    with filled(tmp_path, specs, edit=overflown("control_cost", ("random",), (1, 3), 20)) as reader:
         part = control_part(select(reader, Filter()))
         curves = measure_control(reader, part)
         entry = next(entry for entry in part.entries if entry.config.policy == "random")
@@ -424,11 +419,12 @@ def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
 
 
 def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/truth.db"
-    task = {"task": {"name": "control", "checkpoints": [20]}}
-    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **task)
-    fill(url, specs, edit=overflown("true_model_cost", ("d_optimal", "random"), tuple(range(5)), 0))
-    with Reader.open(url) as reader:
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **TASK)
+    with filled(
+        tmp_path,
+        specs,
+        edit=overflown("true_model_cost", ("d_optimal", "random"), tuple(range(5)), 0),
+    ) as reader:
         part = control_part(select(reader, Filter()))
         curves = measure_control(reader, part)
         table = compare_control(reader, part)
@@ -439,15 +435,14 @@ def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> 
 
 
 def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/ceiling.db"
-    task = {"task": {"name": "control", "checkpoints": [20]}}
-    specs = make_grid(("pendulum",), ("d_optimal",), range(3), **SHORT, **task)
-    specs += make_grid(("pendulum",), ("random",), range(5), **SHORT, **task)
+    specs = make_grid(("pendulum",), ("d_optimal",), range(3), **SHORT, **TASK)
+    specs += make_grid(("pendulum",), ("random",), range(5), **SHORT, **TASK)
     policies = ("d_optimal", "random")
     missed = valued("true_model_success", policies, (0, 4), 0, 0.0)
     crashed = overflown("true_model_cost", policies, (4,), 0)
-    fill(url, specs, edit=lambda spec, result: crashed(spec, missed(spec, result)))
-    with Reader.open(url) as reader:
+    with filled(
+        tmp_path, specs, edit=lambda spec, result: crashed(spec, missed(spec, result))
+    ) as reader:
         curves = measure_control(reader, control_part(select(reader, Filter())))
     truth = curves[0].truth
     assert truth == curves[1].truth
@@ -599,11 +594,9 @@ def test_the_power_of_a_bang_bang_input_is_its_bound_squared(reader: Reader) -> 
 
 
 def test_a_policy_of_which_every_trial_diverged_is_named(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
     specs = make_grid(("cartpole",), ("d_optimal", "random"), range(3), **SHORT)
     lost = {spec.trial_key: 9 for spec in specs if spec.policy.name == "random"}
-    fill(url, specs, diverged=lost)
-    with Reader.open(url) as reader:
+    with filled(tmp_path, specs, diverged=lost) as reader:
         spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
     assert [one.policy for one in spectra.policies] == ["d_optimal"]
     assert spectra.diverged == ("random",)

@@ -53,21 +53,6 @@ def of_the_product(state: Any, parameters: Any) -> tuple[Any, ...]:
             {"accelerations": of_the_product, "linear_parameters": ("length", "friction")},
             r"linear_parameters of env 'pendulum' are length, friction, but .* not affine in them",
         ),
-    ],
-)
-def test_wrong_names_of_parameters_are_refused(attributes: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(SpecificationError, match=sentence):
-        check_system(broken_system(**attributes))
-
-
-def test_a_product_is_affine_in_each_parameter_alone() -> None:
-    check_system(broken_system(accelerations=of_the_product, linear_parameters=("friction",)))
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    ("attributes", "sentence"),
-    [
         (
             {"accelerations": lambda state, *_: (1.0 / state[1],), "compiled": False},
             r"^accelerations\(\) of env 'pendulum' gives inf for the derivative of .* at the "
@@ -83,9 +68,15 @@ def test_a_product_is_affine_in_each_parameter_alone() -> None:
         ),
     ],
 )
-def test_equations_without_numbers_are_refused(attributes: dict[str, Any], sentence: str) -> None:
+def test_wrong_names_and_equations_without_numbers_are_refused(
+    attributes: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(SpecificationError, match=sentence):
         check_system(broken_system(**attributes))
+
+
+def test_a_product_is_affine_in_each_parameter_alone() -> None:
+    check_system(broken_system(accelerations=of_the_product, linear_parameters=("friction",)))
 
 
 @pytest.mark.filterwarnings("error")

@@ -24,21 +24,14 @@ import dopt.gymnasium  # noqa: E402
 from tests.dopt.custom_environments import DRAG, PIECE, SEEN, TAKEN  # noqa: E402
 
 POINT = "tests.dopt.custom_environments.Point"
+SMALL = {"name": "mlp", "width": 8}
 IDS = [f"dopt/{''.join(map(str.capitalize, name.split('_')))}-v0" for name in SYSTEMS]
 
 
 def specification(
     target: str = POINT, policy: str = "d_optimal", seed: int = 0, **env: Any
 ) -> TrialSpec:
-    return TrialSpec.from_mapping(
-        {
-            "env": {"_target_": target, **env},
-            "policy": {"name": policy},
-            "model": {"name": "mlp", "width": 8},
-            "learner": {"name": "adam_window"},
-            "seed": seed,
-        }
-    )
+    return TrialSpec.from_names({"_target_": target, **env}, policy, model=SMALL, seed=seed)
 
 
 @pytest.mark.parametrize("identity", IDS)
@@ -226,9 +219,6 @@ def test_what_needs_the_truth_is_refused() -> None:
         TrialSpec.from_mapping(spec.to_mapping() | {"task": {"name": "control"}})
 
 
-LEARNERS = ("adam_window", "gauss_newton", "ekf", "adam_replay")
-
-
 def rough(
     identity: str,
     policy: str = "d_optimal",
@@ -236,19 +226,9 @@ def rough(
     seed: int = 0,
     **env: Any,
 ) -> TrialSpec:
-    section = {
-        "_target_": "tests.dopt.custom_environments.Rough",
-        "id": f"dopt_tests/{identity}-v0",
-    }
-    return TrialSpec.from_mapping(
-        {
-            "env": {**section, "horizon": 30, **env},
-            "policy": {"name": policy},
-            "model": {"name": "mlp", "width": 8},
-            "learner": {"name": learner} if isinstance(learner, str) else learner,
-            "seed": seed,
-        }
-    )
+    target = "tests.dopt.custom_environments.Rough"
+    section = {"_target_": target, "id": f"dopt_tests/{identity}-v0", "horizon": 30, **env}
+    return TrialSpec.from_names(section, policy, model=SMALL, learner=learner, seed=seed)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.5, 2.0])

@@ -17,7 +17,6 @@ from dopt.limits import Limits
 from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.run import run_trial
-from dopt.spec.config import config_label
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import delay, differentiated
 from dopt.types import Array
@@ -152,11 +151,6 @@ def test_sections_describe_their_limits() -> None:
     assert one_sided.to_section()["bounds"] == {"y": [None, 2.0]}
     assert limited("cartpole", {"name": "none"}).limits is None
     assert "limits" not in limited("cartpole", None).config_json
-
-
-def test_labels_name_the_bounds() -> None:
-    label = config_label(limited("cartpole", RAIL).config.content())
-    assert label.endswith("limits, y=[-2, 2]")
 
 
 WRONG = [

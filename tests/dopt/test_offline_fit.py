@@ -39,7 +39,6 @@ from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, CoupledPendulums
 from dopt.types import Array
-from tests.close import assert_close
 from tests.dopt.custom_networks import model_of_one
 from tests.dopt.explorer.plants import following
 from tests.dopt.explorer.test_measurements import ENCODER, JOINT
@@ -99,7 +98,7 @@ def test_a_fit_ends_at_a_minimum_of_its_objective(env: str, ridge: float) -> Non
     foreseen = slope @ np.linalg.solve(J.T @ J + ridge * np.eye(len(theta)), slope)
     assert fitted.converged
     assert foreseen < 1e-4 * value  # what an undamped step would still gain
-    assert_close(fitted.residual, np.sqrt(e @ e / len(samples.states)), rel=1e-9)
+    np.testing.assert_allclose(fitted.residual, np.sqrt(e @ e / len(samples.states)), rtol=1e-9)
 
 
 def test_each_network_of_an_ensemble_is_fitted_by_itself() -> None:
@@ -129,7 +128,7 @@ def test_a_fit_of_a_linear_model_is_the_ridge_solution_and_recovers_the_physics(
     samples = uniform_samples(spec)
     fitted = fit_offline(spec, samples.states, samples.accelerations)
     truth = [getattr(spec.system, name) for name in spec.system.linear_parameters]
-    assert_close(fitted.parameters, np.array(truth), abs=1e-2)
+    np.testing.assert_allclose(fitted.parameters, np.array(truth), rtol=0.0, atol=1e-2)
     assert fitted.loss < 1e-2
 
 
@@ -155,7 +154,7 @@ def test_the_loss_is_that_of_a_trial_after_its_last_step() -> None:
     for env in ("pendulum", "drifting_pendulum"):
         spec = small(env)
         result = dopt.run_trial(spec)
-        assert_close(grid_loss(spec, result.parameters), result.final_loss, rel=1e-5)
+        np.testing.assert_allclose(grid_loss(spec, result.parameters), result.final_loss, rtol=1e-5)
 
 
 @pytest.mark.parametrize("env", ["pendulum", "quadrotor", "drifting_pendulum"])
@@ -167,7 +166,7 @@ def test_recorded_samples_are_what_the_learner_was_given(env: str) -> None:
     running.advance(spec.system.horizon)
     samples = recorded_samples(spec.system, running.record.states, running.record.inputs)
     given = observed(running, running.done)
-    assert_close(samples.accelerations, given, rel=1e-9, abs=1e-9)
+    np.testing.assert_allclose(samples.accelerations, given, rtol=5e-10, atol=5e-10)
     assert np.array_equal(samples.states, rerun(spec, [spec.system.horizon]).states[:-1])
 
 
@@ -181,7 +180,9 @@ def test_uniform_samples_fill_the_box_with_the_noise_of_the_trial() -> None:
     others = [i for i in range(system.n_states) if i not in system.grid_box()]
     assert not samples.states[:, others].any()
     noise = draw(spec).noise[:, list(system.learned_rows)] / system.dt
-    assert_close(samples.accelerations - system.learned(samples.states), noise, abs=1e-12)
+    np.testing.assert_allclose(
+        samples.accelerations - system.learned(samples.states), noise, rtol=0.0, atol=1e-12
+    )
     other = uniform_samples(trial("cartpole", "uniform", 2, env={"horizon": 400}, model=SMALL))
     assert np.array_equal(samples.states, other.states)
 

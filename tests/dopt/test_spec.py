@@ -8,25 +8,21 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.learning import LEARNERS
-from dopt.models import MODELS
 from dopt.policies import POLICIES, TITLES
-from dopt.registry import build
 from dopt.run import run_trial
 from dopt.spec.config import completed, config_label, labels, value_label
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Pendulum
 from dopt.systems.properties import euler_spectral_radius, jacobians
+from tests.analysis.synthetic import make_spec
 from tests.dopt.trials import ALL_PAIRS, covering, trial
 from tests.paths import CONF
 
@@ -265,16 +261,7 @@ Config = Mapping[str, object]
 
 def config(system: str, name: str, **sections: Mapping[str, object]) -> Config:
     """Return the stored form of a configuration; ``sections`` override fields."""
-    linear = name == "oracle"
-    mapping: dict[str, Mapping[str, object]] = {
-        "env": {"name": system},
-        "policy": {"name": name},
-        "model": {"name": "linear" if linear else "mlp"},
-        "learner": {"name": "recursive_least_squares" if linear else "adam_window"},
-    }
-    for key, fields in sections.items():
-        mapping[key] = {**mapping.get(key, {}), **fields}
-    found: Config = json.loads(TrialSpec.from_mapping(mapping).config_json)
+    found: Config = json.loads(make_spec(system, name, 0, **sections).config_json)
     return found
 
 
@@ -401,17 +388,6 @@ def test_a_value_has_words_of_its_own(path: str, value: object, text: str) -> No
 UNSTABLE_AT_REST = {"moving_star", "van_der_pol"}
 """A star that pushes away, and an oscillator that is fed."""
 
-GROUPS: list[tuple[str, dict[str, Any]]] = [("model", MODELS), ("learner", LEARNERS)]
-
-
-def section_in(path: Path) -> dict[str, object]:
-    section = OmegaConf.to_container(OmegaConf.merge({"width": 16}, OmegaConf.load(path)))
-    assert isinstance(section, dict)
-    section = section.get("policy", section)
-    return {k: v for k, v in section.items() if k not in ("width", "defaults")} | (
-        {"width": 16} if path.parent.name == "model" and section["name"] == "mlp" else {}
-    )
-
 
 def reasons_of(name: str) -> str:
     """Return the reasons for the numbers of a system, in its file or its class, on one line."""
@@ -462,16 +438,6 @@ def test_a_trial_starts_close_to_rest(name: str) -> None:
     rest = np.array(system.equilibrium or np.zeros(system.n_states))
     rest[[i for i, label in enumerate(system.state_labels) if label.startswith("e₀")]] = 1.0
     assert system.initial_state == pytest.approx(rest, abs=0.01)
-
-
-@pytest.mark.parametrize(("group", "registry"), GROUPS, ids=[group for group, _ in GROUPS])
-def test_every_registered_choice_has_a_file_that_loads(
-    group: str, registry: dict[str, Any]
-) -> None:
-    paths = sorted((CONF / group).rglob("*.yaml"))
-    assert paths
-    built = [build(group, registry, section_in(path)) for path in paths]
-    assert {item.name for item in built} == set(registry)
 
 
 CASES: list[tuple[Callable[..., Any], tuple[Any, ...], str]] = [

@@ -84,19 +84,6 @@ def test_no_random_point_is_better(
     assert value(Q, v, points).max() <= best + 1e-12 * size(Q, v, radius)
 
 
-@settings(max_examples=60)
-@given(st.integers(0, 10_000), st.floats(-2, 2), st.floats(-2, 2), st.floats(0.0, 3.0))
-def test_two_inputs_against_a_dense_scan(
-    seed: int, first: float, second: float, share: float
-) -> None:
-    Q, axes = from_eigenvalues(np.array([first, second]), seed)
-    v = share * axes @ np.random.default_rng(seed).standard_normal(2)
-    angles = np.linspace(0.0, 2.0 * np.pi, 7_201)
-    circle = 1.7 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    u = maximize_on_sphere(Q, v, 1.7, np.ones(2))
-    assert value(Q, v, u) >= value(Q, v, circle).max() - 1e-13 * (1 + np.abs(Q).max() + share)
-
-
 @given(st.floats(-1e8, 1e8), st.floats(-1e8, 1e8), st.floats(1e-3, 1e3))
 def test_one_input_goes_against_v(q: float, v: float, radius: float) -> None:
     u = maximize_on_sphere(np.array([[q]]), np.array([v]), radius, np.array([-0.3]))
@@ -161,19 +148,6 @@ def test_repeated_top_eigenvalues_share_the_answer() -> None:
     assert u[1] / u[2] == pytest.approx(-0.3 / 0.4)
 
 
-@settings(max_examples=60)
-@given(problems(), st.integers(-60, 60))
-@example((np.diag([1.0, 2.0]), np.array([0.5, 0.5]), 1.0, np.ones(2)), 60)
-def test_the_scale_of_the_objective_does_not_matter(
-    problem: tuple[np.ndarray, np.ndarray, float, np.ndarray], power: int
-) -> None:
-    Q, v, radius, tie = problem
-    factor = 2.0**power
-    u, scaled = (maximize_on_sphere(f * Q, f * v, radius, tie) for f in (1.0, factor))
-    best = value(Q, v, u)
-    assert value(Q, v, scaled) == pytest.approx(best, rel=0.0, abs=1e-12 * size(Q, v, radius))
-
-
 def test_only_the_symmetric_part_counts() -> None:
     Q, v = np.array([[1.0, 3.0], [-1.0, 0.5]]), np.array([0.2, -0.1])
     symmetric = maximize_on_sphere(0.5 * (Q + Q.T), v, 1.5, np.ones(2))
@@ -191,14 +165,6 @@ def test_the_smallest_numbers_are_no_obstacle(unit: float, radius: float) -> Non
         assert np.linalg.norm(u) == pytest.approx(radius)
         if radius * unit > 1e-318:
             assert u == pytest.approx([0.0, radius], abs=1e-6 * radius)
-
-
-@pytest.mark.parametrize("unit", [1e100, 1e200, 1e300])
-def test_the_largest_numbers_are_no_obstacle(unit: float) -> None:
-    u = maximize_on_sphere(
-        unit * np.diag([1.0, 4.0]), unit * np.array([0.0, -1.0]), 10.0, np.ones(2)
-    )
-    assert u == pytest.approx([0.0, 10.0])
 
 
 @settings(max_examples=100)
@@ -248,22 +214,18 @@ def test_the_arguments_are_not_changed() -> None:
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4, 7])
-@pytest.mark.parametrize("count", [1, 2, 8, 33, LARGEST_REPELLED + 1])
-def test_directions_are_unit_vectors_and_always_the_same(m: int, count: int) -> None:
-    found = sphere_directions(m, count)
-    assert found.shape == (2 if m == 1 else count, m)
-    assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, rel=1e-12)
-    assert np.array_equal(found, sphere_directions.__wrapped__(m, count))
+def test_directions_are_unit_vectors_and_always_the_same(m: int) -> None:
+    for count in (1, 2, 8, 33, LARGEST_REPELLED + 1):
+        found = sphere_directions(m, count)
+        assert found.shape == (2 if m == 1 else count, m)
+        assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, rel=1e-12)
+        assert np.array_equal(found, sphere_directions.__wrapped__(m, count))
 
 
 @given(st.integers(1, 6), st.integers(1, 40))
 def test_no_direction_comes_twice(m: int, count: int) -> None:
     found = sphere_directions(m, count)
     assert len(np.unique(found.round(9), axis=0)) == len(found)
-
-
-def test_one_input_has_two_directions() -> None:
-    assert sphere_directions(1, 16).tolist() == [[1.0], [-1.0]]
 
 
 @pytest.mark.parametrize("count", [7, 16])
@@ -348,14 +310,14 @@ def test_both_solvers_take_the_same_direction_where_v_is_zero(
 
 @pytest.mark.parametrize("unit", [1e-320, 1e-200, 1e200, 1e308])
 @pytest.mark.parametrize("radius", [1e-200, 1.0, 1e200])
-@pytest.mark.parametrize("v", [[0.0, 0.0], [0.0, -1e-300], [0.0, -1.0]])
-def test_both_solvers_bear_numbers_of_any_size(unit: float, radius: float, v: list[float]) -> None:
+def test_both_solvers_bear_numbers_of_any_size(unit: float, radius: float) -> None:
     Q, tie = unit * np.diag([0.25, 1.0]), np.array([0.1, 0.9])
-    expected = maximize_on_sphere(Q, np.array(v), radius, tie)
-    batch = [torch.tensor(np.asarray(array))[None] for array in (Q, v, tie)]
-    found = maximize_on_spheres(batch[0], batch[1], radius, batch[2])[0].numpy()
-    assert expected / radius == pytest.approx([0.0, 1.0], abs=1e-9)
-    assert found / radius == pytest.approx([0.0, 1.0], abs=1e-9)
+    for v in ([0.0, 0.0], [0.0, -1e-300], [0.0, -1.0]):
+        expected = maximize_on_sphere(Q, np.array(v), radius, tie)
+        batch = [torch.tensor(np.asarray(array))[None] for array in (Q, v, tie)]
+        found = maximize_on_spheres(batch[0], batch[1], radius, batch[2])[0].numpy()
+        assert expected / radius == pytest.approx([0.0, 1.0], abs=1e-9)
+        assert found / radius == pytest.approx([0.0, 1.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("v", [-0.7, 0.0, 0.7])

@@ -19,15 +19,8 @@ BROKEN_SEED = 2
 
 def specification(seed: int = 0, **env: object) -> TrialSpec:
     """Return a short trial of the pendulum."""
-    return TrialSpec.from_mapping(
-        {
-            "env": {"name": "pendulum", "horizon": 5, **env},
-            "policy": {"name": "random"},
-            "model": {"name": "mlp", "width": 2},
-            "learner": {"name": "adam"},
-            "seed": seed,
-        }
-    )
+    section, model = {"name": "pendulum", "horizon": 5, **env}, {"name": "mlp", "width": 2}
+    return TrialSpec.from_names(section, "random", model=model, learner="adam", seed=seed)
 
 
 def quick(spec: TrialSpec) -> TrialResult:

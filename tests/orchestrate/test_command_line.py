@@ -174,14 +174,6 @@ def test_a_trial_prints_its_result_and_is_stored(command_line: Command, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["results"]
 
 
-def test_the_policies_that_search_run_by_name(command_line: Command) -> None:
-    names = ("exact", "trace", "trace_linearized", "a_optimal", "e_optimal", "task", "lookahead")
-    policies = ",".join(f"beyond/{name}" for name in names)
-    code, output, errors = command_line("-m", f"policy={policies}", "seed=0", *SHORT)
-    assert code == 0, output + errors
-    assert "7 of 7 done, 0 failed" in output
-
-
 def test_a_grid_runs_once_and_the_default_is_a_hundred_seeds(command_line: Command) -> None:
     grid = ("-m", "env=glob(*)", "policy=random,periodic", *LOCAL)
     code, output, _ = command_line(*grid)

@@ -202,9 +202,11 @@ def test_a_wrong_share_is_refused(given: object) -> None:
         ((*GRID, "store=shards", "launch.share=1/2", "store.url=postgresql://x/y"), "x.db"),
         (("env=pendulum", "launch.share=1/2"), "launch.share is for grids"),
         ((*GRID, "launch.share=1/2", "launch.detach=true"), "takes a part of it"),
+        (("env=pendulum", "launch.detach=true"), "launch.detach is for grids"),
+        ((*GRID, "launch.detach=true", "launch.until=ci<5%"), "leave one of the two out"),
     ],
 )
-def test_what_does_not_go_with_shares_is_refused(
+def test_what_does_not_go_with_shares_or_leaving_is_refused(
     command_line: Launch, words: tuple[str, ...], named: str
 ) -> None:
     code, _, err = command_line(*words)

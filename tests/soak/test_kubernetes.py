@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, text
 
-from tests.docker.test_kubernetes import Manifest, of_kind
+from tests.docker.test_files import Manifest, of_kind
 from tests.paths import ROOT
 
 ENTRY_POINT = ROOT / "docker" / "entrypoint.sh"

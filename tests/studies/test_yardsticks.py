@@ -124,17 +124,6 @@ def test_other_bounds_are_another_question(
     assert "holds no trials of a published table" in capsys.readouterr().err
 
 
-def test_two_kinds_of_one_policy_are_refused_disks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    address = f"sqlite:///{tmp_path}/two.db"
-    fill(address, [disk("random", 0), disk("random", 0, horizon=10)], edit=simulated)
-    assert main(["--db", address, "--out", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert "rate within 4.5 rad/s with the policy 'random'" in said
-    assert "choose by --where" in said
-
-
 LEARNED: dict[str, dict[str, Any]] = {
     "model": {"name": "linear"},
     "learner": {"name": "ekf", "regularization": 1e-8},
@@ -199,7 +188,7 @@ def test_the_table_shows_the_published_rows(
     assert table_3.published_exponent("FLEX") == pytest.approx(1.18, abs=0.005)
 
 
-def test_databases_without_such_trials_and_with_two_kinds_are_refused(
+def test_a_database_without_such_trials_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     address = f"sqlite:///{tmp_path}/other.db"
@@ -209,11 +198,6 @@ def test_databases_without_such_trials_and_with_two_kinds_are_refused(
         "experiment=flex_table1 or flex_table3 or flex_star or active_sysid"
         in capsys.readouterr().err
     )
-    fill(address, [pendulums("random", 2, 0), pendulums("random", 2, 0, gamma=2.0)], edit=simulated)
-    assert main(["--db", address, "--out", str(tmp_path)]) == 2
-    assert "choose by --where" in capsys.readouterr().err
-    asked = ["--where", "env.gamma=2.0", "--out", str(tmp_path)]
-    assert main(["--db", address, *asked]) == 0
 
 
 BOX = {"name": "grey_box", "unknown": list(CENTRE), "initial": [0.1, 0.1]}
@@ -267,15 +251,6 @@ def test_medians_counts_and_ratios_of_stars_follow_from_the_trials(
     learner = "adam, rate 0.02"
     logs = np.log(by_seed[learner, "exact"] / by_seed[learner, "random"])
     assert table.ratio[learner, "exact"] == pytest.approx(np.exp(logs.mean()))
-
-
-def test_two_kinds_of_one_policy_are_refused_stars(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    address = f"sqlite:///{tmp_path}/two.db"
-    fill(address, [star("random", 0), star("random", 0, gamma=20.0)], edit=simulated)
-    assert main(["--db", address, "--out", str(tmp_path)]) == 2
-    assert "choose by --where" in capsys.readouterr().err
 
 
 SOLVED = {
@@ -368,18 +343,6 @@ def test_the_tables_show_the_published_rows_and_what_is_censored(
     assert ["d_optimal", "1.00; 0.25"] in rows
 
 
-def test_two_learners_of_one_policy_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    address = f"sqlite:///{tmp_path}/two.db"
-    specs = [swing_up("random", 0), swing_up("random", 0, learner={"name": "gauss_newton"})]
-    fill(address, specs, edit=solved_as_listed)
-    assert main(["--db", address, "--out", str(tmp_path)]) == 2
-    assert "choose by --where" in capsys.readouterr().err
-    asked = ["--where", "learner.name=gauss_newton", "--out", str(tmp_path)]
-    assert main(["--db", address, *asked]) == 0
-
-
 def test_a_policy_that_learns_the_task_has_a_row_for_its_own_feedback(tmp_path: Path) -> None:
     def edit(spec: TrialSpec, result: TrialResult) -> TrialResult:
         result = solved_as_listed(spec, result)
@@ -399,6 +362,40 @@ def test_a_policy_that_learns_the_task_has_a_row_for_its_own_feedback(tmp_path: 
     table = pd.read_csv(tmp_path / "flex_table1.csv").set_index("policy")
     assert set(table.index) == {"random", "d_optimal", "d_optimal, its own feedback"}
     assert table.samples_unsolved["d_optimal, its own feedback"] == 0
+
+
+@pytest.mark.parametrize(
+    ("specs", "said", "where"),
+    [
+        (
+            [disk("random", 0), disk("random", 0, horizon=10)],
+            "rate within 4.5 rad/s with the policy 'random'",
+            "env.horizon=10",
+        ),
+        ([pendulums("random", 2, 0), pendulums("random", 2, 0, gamma=2.0)], "", "env.gamma=2.0"),
+        ([star("random", 0), star("random", 0, gamma=20.0)], "", "env.gamma=20.0"),
+        (
+            [swing_up("random", 0), swing_up("random", 0, learner={"name": "gauss_newton"})],
+            "",
+            "learner.name=gauss_newton",
+        ),
+    ],
+)
+def test_two_kinds_of_one_policy_are_refused(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    specs: list[TrialSpec],
+    said: str,
+    where: str,
+) -> None:
+    given = ["--db", f"sqlite:///{tmp_path}/two.db", "--out", str(tmp_path)]
+    is_listed = specs[0].system.name == "pendulum"
+    fill(given[1], specs, edit=solved_as_listed if is_listed else simulated)
+    assert main(given) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert "choose by --where" in error
+    assert main([*given, "--where", where]) == 0
 
 
 SIZES = (2, 5, 10, 20, 50)

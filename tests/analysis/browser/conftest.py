@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import pytest
-from sqlalchemy import text
 from starlette.testclient import TestClient
 
 from analysis.serve.app import create_app
 from orchestrate.store import Reader
 from tests.analysis.browser import grids
+from tests.orchestrate.store.databases import new_schema
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -37,15 +36,9 @@ def variants_grid(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="session")
 def postgresql_grid(request: pytest.FixtureRequest) -> Iterator[str]:
-    server = request.getfixturevalue("server")
-    schema = f"test_{uuid.uuid4().hex}"
-    with server.begin() as connection:
-        connection.execute(text(f"CREATE SCHEMA {schema}"))
-    url = f"{request.getfixturevalue('server_url')}?options=-csearch_path%3D{schema}"
-    grids.mixed(url)
-    yield url
-    with server.begin() as connection:
-        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+    with new_schema(request) as url:
+        grids.mixed(url)
+        yield url
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -62,11 +62,14 @@ def explorer(**more: Any) -> Explorer:
     return Explorer(MOTOR, **{"policy": "random", "steps": STEPS, **more})
 
 
-def drive(one: Explorer, steps: int) -> None:
-    x = one.states[-1] if one.n_steps else np.array([0.1, 0.0])
+def drive(one: Explorer, steps: int, x: Array | None = None) -> Array:
+    """Let the motor follow the answers of an explorer, from a state on; return the last state."""
+    if x is None:
+        x = one.states[-1] if one.n_steps else np.array([0.1, 0.0])
     for _ in range(steps):
         x = following(x, one.ask(x))
         one.tell(x)
+    return x
 
 
 def content(url: str) -> dict[str, Any]:

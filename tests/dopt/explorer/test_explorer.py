@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -70,22 +69,12 @@ def test_fed_the_states_of_a_trial_it_chooses_its_inputs(
     assert np.array_equal(explorer.states, trial.states)
 
 
-def explored(explorer: Explorer, steps: int, x: Any = (0.1, 0.0)) -> np.ndarray:
-    """Let an explorer drive the motor for some steps; return the last state."""
-    x = np.array(x)
-    for _ in range(steps):
-        u = explorer.ask(x)
-        x = following(x, u)
-        explorer.tell(x)
-    return x
-
-
 def test_the_accelerations_of_a_plant_are_learned() -> None:
     explorer = Explorer(MOTOR, learner="gauss_newton", steps=300)
     states = MOTOR.system(1).grid()
     truth = np.array([motor_acceleration(x) for x in states])
     before = explorer.predict(states)[:, 0] - truth
-    explored(explorer, 300)
+    drive(explorer, 300)
     after = explorer.predict(states)[:, 0] - truth
     assert np.sqrt(np.mean(after**2)) < 0.05 * np.sqrt(np.mean(before**2))
     assert np.all(np.abs(explorer.inputs) <= MOTOR.gamma * (1 + 1e-9))
@@ -96,7 +85,7 @@ def test_the_effect_of_an_input_is_learned() -> None:
     with pytest.raises(IncompatibleError, match="a model that learns the effect of the inputs"):
         Explorer(unknown)
     explorer = Explorer(unknown, model="affine", learner="gauss_newton", steps=300)
-    explored(explorer, 300)
+    drive(explorer, 300)
     states = MOTOR.system(1).grid()
     free, pushed = (
         explorer.predict(states, np.full((len(states), 1), u))[:, 0] for u in (0.0, MOTOR.gamma)
@@ -160,7 +149,7 @@ class TestFreeRun:
     def test_a_learned_model_predicts_it(self) -> None:
         explorer = Explorer(MOTOR, learner="gauss_newton", steps=300)
         before = explorer.free_run_error(*self.recorded(200), steps=20)
-        explored(explorer, 300)
+        drive(explorer, 300)
         after = explorer.free_run_error(*self.recorded(200), steps=20)
         assert after < 0.02 < 0.2 < before
 
@@ -201,34 +190,12 @@ def cut_prediction(x: np.ndarray) -> float:
     return float(Explorer(MOTOR, policy="random", steps=5).predict(x)[0, 0])
 
 
-def test_a_late_plan_is_replaced_by_the_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
-    explorer = Explorer(MOTOR, steps=20, deadline=PATIENCE_SECONDS, fallback=[0.25])
-    x = np.array([0.1, 0.0])
-    x = following(x, explorer.ask(x))
-    explorer.tell(x)
-    may_end, plan = threading.Event(), explorer._state.steps.plan_input
-
-    def slow(t: int) -> None:
-        may_end.wait(PATIENCE_SECONDS)
-        plan(t)
-
-    monkeypatch.setattr(explorer._state.steps, "plan_input", slow)
-    monkeypatch.setattr(explorer._planner, "_deadline", 0.05)
-    assert explorer.ask(x) == 0.25
-    assert not may_end.is_set()
-    may_end.set()
-    assert explorer.tell(following(x, np.array([0.25])))
-    assert explorer.counts["missed"] == 1
-    assert explorer.inputs[1] == 0.25
-    explorer.close()
-
-
 def test_a_plan_in_time_is_that_without_a_deadline() -> None:
     with (
         Explorer(MOTOR, steps=20, deadline=PATIENCE_SECONDS) as punctual,
         Explorer(MOTOR, steps=20) as plain,
     ):
-        assert np.array_equal(explored(punctual, 20), explored(plain, 20))
+        assert np.array_equal(drive(punctual, 20), drive(plain, 20))
 
 
 class TestRefusals:
@@ -242,7 +209,7 @@ class TestRefusals:
 
     def test_more_steps_than_there_is_room_for(self) -> None:
         explorer = Explorer(MOTOR, steps=2)
-        x = explored(explorer, 2)
+        x = drive(explorer, 2)
         with pytest.raises(ExplorationError, match="all 2 steps"):
             explorer.ask(x)
         with pytest.raises(ExplorationError, match="all 2 steps"):
@@ -301,7 +268,7 @@ class TestRefusals:
         learner = {"name": "adam_window", "learning_rate": 1e300}
         explorer = Explorer(MOTOR, learner=learner, policy="random", steps=50)
         with pytest.raises(ExplorationError, match="not finite"):
-            explored(explorer, 50)
+            drive(explorer, 50)
 
 
 def test_numbers_of_numpy_describe_the_same_exploration() -> None:
@@ -425,7 +392,7 @@ def test_episodes_are_planned_before_the_first_question() -> None:
 @pytest.mark.parametrize("deadline", [None, PATIENCE_SECONDS])
 def test_a_plan_that_fails_is_said_once_and_costs_no_state(deadline: float | None) -> None:
     explorer = Explorer(MOTOR, policy="d_optimal", steps=30, deadline=deadline)
-    x = explored(explorer, 3)
+    x = drive(explorer, 3)
     planner: Any = explorer._planner
     make, planner._make = planner._make, _failing
     with pytest.raises(RuntimeError, match="no plan"):

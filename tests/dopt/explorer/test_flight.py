@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -100,36 +99,6 @@ def test_the_plan_is_that_of_a_simulated_system_behind_the_same_delay(policy: st
         real.tell(x)
         own.tell(x[:2])
     np.testing.assert_allclose(own.errors, real.errors, rtol=1e-6)
-
-
-def test_a_journal_gives_the_same_exploration_bit_for_bit(tmp_path: Path) -> None:
-    plant = declared(delay=1.5 * DT, lag=0.02, supply=5.0)
-
-    def half(path: Path, first: int, last: int) -> Explorer:
-        explorer = Explorer(plant, steps=60, journal=path, fsync=False, learner="gauss_newton")
-        rng, x = np.random.default_rng(1), np.array([0.1, 0.0])
-        for t in range(last):
-            force = np.array([rng.uniform(-9, 9)])
-            noise = rng.standard_normal(2)
-            if t >= first:
-                time = t * DT + (0.05 if t > 12 else 0.0)
-                explorer.ask(x, time=time)
-                applied = force if t % 3 == 0 else None
-                late = 0.05 if t == 12 else 0.0  # a gap
-                explorer.tell(x + 0.01 * noise, applied=applied, time=time + DT + late)
-            x = x + 0.01 * noise
-            if t == 20 and t >= first:
-                explorer.reset()
-        explorer.close()
-        return explorer
-
-    whole = half(tmp_path / "whole.jsonl", 0, 40)
-    half(tmp_path / "cut.jsonl", 0, 25)
-    resumed = half(tmp_path / "cut.jsonl", 25, 40)
-    for name in ("states", "inputs", "errors", "parameters"):
-        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
-    assert whole.counts == resumed.counts
-    assert whole.counts["gaps"] == whole.counts["resets"] == 1
 
 
 def asked(explorer: Explorer, u: float, x: Array, time: float | None = None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import io
 import json
@@ -20,13 +21,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt import Explorer
+from dopt import Explorer, Plant
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Journal
 from dopt.spec.trial import stored_trial
 from dopt.systems import Pendulum
-from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, following, steered, without_checksums
-from tests.dopt.explorer.test_explorer import explored
+from tests.dopt.explorer.plants import (
+    HOVERCRAFT,
+    MOTOR,
+    drive,
+    following,
+    steered,
+    without_checksums,
+)
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
@@ -34,9 +41,6 @@ from tests.waiting import PATIENCE_SECONDS
 @pytest.fixture
 def journal(tmp_path: Path) -> Path:
     return tmp_path / "runs" / "motor.jsonl"
-
-
-SHORT = {"name": "icem", "lookahead": 8, "hold": 4, "stride": 4, "plans": 12}
 
 
 ABOUT: dict[str, Any] = {"format": 1, "trial": {}}
@@ -97,12 +101,12 @@ def test_a_killed_process_has_lost_nothing_that_was_told(journal: Path) -> None:
 @pytest.mark.parametrize("cut", [1, 7])
 def test_a_torn_line_is_dropped(journal: Path, cut: int) -> None:
     with Explorer(MOTOR, steps=9, journal=journal) as explorer:
-        x = explored(explorer, 4)
+        x = drive(explorer, 4)
         explorer.ask(x)
     os.truncate(journal, journal.stat().st_size - cut)
     with Explorer(MOTOR, steps=9, journal=journal) as explorer:
         assert explorer.n_steps == 4
-        explored(explorer, 5, x)
+        drive(explorer, 5, x)
     assert all(json.loads(line) for line in journal.read_text().splitlines())
 
 
@@ -155,7 +159,7 @@ def test_a_journal_from_before_there_were_scales_goes_on_in_units(journal: Path)
         assert explorer.errors[[0, 7]] == pytest.approx(errors, rel=1e-9)
         before = "fe24e8c0690435ed84ff0e449e019588c6caa623b6856db59eb6b06f54bfc075"
         assert explorer.spec.trial_key == before
-        explored(explorer, 5, explorer.states[-1])
+        drive(explorer, 5, explorer.states[-1])
         parameters = explorer.parameters
     with Explorer(MOTOR, **given) as again:
         assert np.array_equal(again.parameters, parameters)
@@ -164,7 +168,7 @@ def test_a_journal_from_before_there_were_scales_goes_on_in_units(journal: Path)
 
 def test_a_new_journal_says_that_its_exploration_is_scaled(journal: Path) -> None:
     with Explorer(MOTOR, steps=9, journal=journal) as explorer:
-        explored(explorer, 4)
+        drive(explorer, 4)
         parameters, key = explorer.parameters, explorer.spec.trial_key
     assert json.loads(journal.read_text().splitlines()[0])["trial"]["env"]["scaled"] is True
     with Explorer(MOTOR, steps=9, journal=journal) as again:
@@ -205,7 +209,7 @@ class Full(io.FileIO):
 
 def test_a_full_disk_ends_the_exploration(journal: Path) -> None:
     explorer = Explorer(MOTOR, steps=9, journal=journal)
-    x = explored(explorer, 3)
+    x = drive(explorer, 3)
     explorer.ask(x)
     written = explorer._journal
     assert written is not None
@@ -228,18 +232,18 @@ def test_what_is_told_is_on_the_disk_before_the_call_returns(
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_size))
     with Explorer(MOTOR, steps=9, journal=journal, fsync=True) as explorer:
-        x = explored(explorer, 2)
+        x = drive(explorer, 2)
         assert synced[-1] == journal.stat().st_size
         explorer.ask(x)
     count = len(synced)
     with Explorer(MOTOR, steps=9, journal=journal, fsync=False) as explorer:
-        explored(explorer, 2, x)
+        drive(explorer, 2, x)
         assert len(synced) == count
 
 
 def test_a_fork_does_not_write_into_the_journal(journal: Path) -> None:
     explorer = Explorer(MOTOR, steps=9, journal=journal)
-    x = explored(explorer, 2)
+    x = drive(explorer, 2)
     assert explorer._journal is not None
     explorer._journal._process += 1  # what a fork finds
     with pytest.raises(ExplorationError, match="another process"):
@@ -252,7 +256,7 @@ def test_a_journal_from_elsewhere_is_replayed_with_a_warning(
 ) -> None:
     """Another processor rounds differently; the exploration goes on with what it was told."""
     with Explorer(MOTOR, steps=9, journal=journal) as explorer:
-        explored(explorer, 4)
+        drive(explorer, 4)
     lines = [json.loads(line) for line in without_checksums(journal).splitlines()]
     for event in lines:
         if "plan" in event:
@@ -285,7 +289,7 @@ def damaged(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("fsync", [False, True])
 def test_a_journal_that_is_removed_is_said(damaged: Path, fsync: bool, replaced: bool) -> None:
     with Explorer(MOTOR, steps=9, journal=damaged, fsync=fsync) as explorer:
-        x = explored(explorer, 3)
+        x = drive(explorer, 3)
         u = explorer.ask(x)
         damaged.unlink()
         if replaced:
@@ -297,9 +301,9 @@ def test_a_journal_that_is_removed_is_said(damaged: Path, fsync: bool, replaced:
 
 def test_a_renamed_journal_holds_what_follows(damaged: Path, tmp_path: Path) -> None:
     with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
-        x = explored(explorer, 3)
+        x = drive(explorer, 3)
         damaged.rename(tmp_path / "renamed.jsonl")
-        explored(explorer, 2, x)
+        drive(explorer, 2, x)
     with Explorer(MOTOR, steps=9, journal=tmp_path / "renamed.jsonl") as again:
         assert again.n_steps == 5
 
@@ -307,7 +311,7 @@ def test_a_renamed_journal_holds_what_follows(damaged: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("end", [b"", b" ", b"}"])
 def test_a_journal_without_newlines_is_kept(damaged: Path, end: bytes) -> None:
     with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
-        explored(explorer, 0 if end else 3)
+        drive(explorer, 0 if end else 3)
     whole = damaged.read_bytes().replace(b"\n", b"") + end
     damaged.write_bytes(whole)
     with pytest.raises(
@@ -344,7 +348,7 @@ DAMAGED: list[object] = [
 @pytest.mark.parametrize("event", DAMAGED)
 def test_a_line_that_is_no_event_is_refused_with_its_number(damaged: Path, event: Any) -> None:
     with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
-        explored(explorer, 1)
+        drive(explorer, 1)
     lines = without_checksums(damaged).splitlines(keepends=True)
     lines.insert(3, f"{json.dumps(event)}\n")
     damaged.write_text("".join(lines))
@@ -357,7 +361,7 @@ def test_a_line_that_is_no_event_is_refused_with_its_number(damaged: Path, event
 
 def test_a_journal_without_its_first_state_is_refused(damaged: Path) -> None:
     with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
-        explored(explorer, 1)
+        drive(explorer, 1)
     first, _, *rest = without_checksums(damaged).splitlines(keepends=True)
     damaged.write_text("".join([first, *rest]))
     with pytest.raises(SpecificationError, match="line 2 is no event that can follow"):
@@ -366,7 +370,7 @@ def test_a_journal_without_its_first_state_is_refused(damaged: Path) -> None:
 
 def test_more_steps_than_there_are_are_refused(damaged: Path) -> None:
     with Explorer(MOTOR, steps=2, journal=damaged) as explorer:
-        explored(explorer, 2)
+        drive(explorer, 2)
     damaged.write_text(f"{without_checksums(damaged)}{json.dumps(LEARN)}\n")
     with pytest.raises(SpecificationError, match="line 7 is no event that can follow"):
         Explorer(MOTOR, steps=2, journal=damaged)
@@ -383,10 +387,10 @@ def test_a_first_line_without_a_specification_is_refused(damaged: Path, trial: o
 def lines(damaged: Path) -> list[bytes]:
     """Return the lines of a journal with some events of each kind."""
     with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
-        x = explored(explorer, 2)
+        x = drive(explorer, 2)
         explorer.tell([np.nan, 0.0])
         explorer.reset()
-        explored(explorer, 2, x)
+        drive(explorer, 2, x)
     return damaged.read_bytes().splitlines(keepends=True)
 
 
@@ -442,7 +446,7 @@ def test_a_journal_of_format_1_goes_on_with_checksums(damaged: Path, lines: list
     old = without_checksums(damaged)
     damaged.write_text(old)
     with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
-        explored(explorer, 2)
+        drive(explorer, 2)
     content = damaged.read_bytes()
     assert content.startswith(old.encode())
     assert opened(damaged, content) == "opened"
@@ -461,8 +465,12 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def replayed(journal: Path) -> Explorer:
-    return Explorer(HOVERCRAFT, journal=journal, fsync=False, **SETTINGS)
+LATE = dataclasses.replace(HOVERCRAFT, delay=1.5 * HOVERCRAFT.dt, lag=0.02, supply=3.0)
+"""The same plant behind hardware, whose inputs in flight are a part of the exploration too."""
+
+
+def replayed(journal: Path, plant: Plant = HOVERCRAFT) -> Explorer:
+    return Explorer(plant, journal=journal, fsync=False, **SETTINGS)
 
 
 def condition(explorer: Explorer) -> dict[str, Any]:
@@ -476,6 +484,7 @@ def condition(explorer: Explorer) -> dict[str, Any]:
         "answer": None if state.answer is None else state.answer.tobytes(),
         "present": None if state.present is None else state.present.tobytes(),
         "time": state.time,
+        "inputs": explorer.inputs.tobytes(),
         "errors": explorer.errors.tobytes(),
     }
 
@@ -499,7 +508,7 @@ def slow_plans(explorer: Explorer) -> Iterator[None]:
         planner._make, planner._deadline = before
 
 
-class Plant:
+class Rig:
     """The hovercraft with its clock, and an explorer that meets all kinds of calls."""
 
     def __init__(self, seed: int) -> None:
@@ -538,8 +547,9 @@ class Plant:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_it_goes_on_as_if_it_had_not_been_closed(seed: int, tmp_path: Path) -> None:
-    whole, cut = replayed(tmp_path / "whole.jsonl"), replayed(tmp_path / "cut.jsonl")
-    one, other = Plant(seed), Plant(seed)
+    plant = LATE if seed % 2 else HOVERCRAFT
+    whole, cut = (replayed(tmp_path / f"{name}.jsonl", plant) for name in ("whole", "cut"))
+    one, other = Rig(seed), Rig(seed)
     closings = np.random.default_rng(100 + seed)
     for _ in range(60):
         one.call(whole)
@@ -547,7 +557,7 @@ def test_it_goes_on_as_if_it_had_not_been_closed(seed: int, tmp_path: Path) -> N
         assert condition(cut) == condition(whole)
         if closings.random() < 0.2:
             cut.close()
-            cut = replayed(tmp_path / "cut.jsonl")
+            cut = replayed(tmp_path / "cut.jsonl", plant)
             whole._wait()  # as closing does: a late plan ends before
             assert condition(cut) == condition(whole)
     assert np.array_equal(cut.ask(one.x, time=one.now), whole.ask(one.x, time=one.now))
@@ -592,6 +602,7 @@ def test_a_question_during_a_late_plan_does_not_wait() -> None:
         assert explorer._planner.is_late
     assert explorer.tell(steered(x, np.array([0.25, -0.25])))
     assert explorer.counts["missed"] == 1
+    assert explorer.inputs[1].tolist() == [0.25, -0.25]
     explorer.close()
 
 

@@ -70,9 +70,9 @@ class TestMeasurements:
 
     def test_an_infinite_acceleration_is_unusable(self) -> None:
         """The known part is infinite at one state: what is seen there is no number."""
-        given = {f.name: getattr(MOTOR, f.name) for f in dataclasses.fields(MOTOR)}
-        pole = {"known": {"angle": "rate", "rate": "gain * voltage + 1 / angle"}}
-        explorer = Explorer(Plant(**(given | pole)), steps=20, learner="gauss_newton")
+        known = {"angle": "rate", "rate": "gain * voltage + 1 / angle"}
+        pole = dataclasses.replace(MOTOR, known=known)
+        explorer = Explorer(pole, steps=20, learner="gauss_newton")
         explorer.ask([0.0, 0.0])
         assert not explorer.tell([0.1, 0.0], applied=[1.0])
         assert explorer.counts["unusable"] == 1

@@ -170,14 +170,10 @@ def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str,
         assert relative_gap(fast.parameters, plain.parameters) < 1e-8
 
 
-@pytest.mark.parametrize("model", [{"width": 9, "depth": 3}, {"width": 20, "depth": 1}])
 @pytest.mark.parametrize("form", ["primal", "dual", "sketch"])
-@pytest.mark.parametrize("env", ["pendulum", "arm"])
-def test_every_form_of_the_information_matrix_agrees(
-    env: str, form: str, model: dict[str, int]
-) -> None:
-    policy = {"form": form, "sketch_size": 48}
-    check_agreement(trial(env, "d_optimal", 2, env={"horizon": 14}, policy=policy, model=model))
+def test_every_form_of_the_information_matrix_agrees_for_a_deep_network(form: str) -> None:
+    policy, model = {"form": form, "sketch_size": 48}, {"width": 9, "depth": 3}
+    check_agreement(trial("arm", "d_optimal", 2, env={"horizon": 14}, policy=policy, model=model))
 
 
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])

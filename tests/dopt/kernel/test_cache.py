@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import importlib.util
 import os
 import pwd
 import subprocess
@@ -29,9 +28,9 @@ from dopt.kernel.compiler import compiled
 from dopt.kernel.warming import leave_callees_out
 from dopt.systems import SYSTEMS
 from dopt.types import CompiledFunction, Vector
-from tests.paths import ROOT
+from tests.paths import ROOT, loaded
 
-MODULE = "def triple(x, out):\n    out[0] = 3.0 * x\n"
+MODULE = "A, B = 1.0, 2.0\n\ndef triple(x, out):\n    out[0] = (A + B) * x\n"
 SIGNATURE = void(float64, float64[::1])
 
 
@@ -53,14 +52,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def triple(tmp_path: Path) -> FunctionType:
     """Return a function of a user's file."""
-    path = tmp_path / "own_triple.py"
-    path.write_text(MODULE)
-    spec = importlib.util.spec_from_file_location("own_triple", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    function: FunctionType = module.triple
+    return written(tmp_path / "own_triple.py", MODULE)
+
+
+def written(path: Path, text: str) -> FunctionType:
+    path.write_text(text)
+    function: FunctionType = loaded(path).triple
     return function
 
 
@@ -123,6 +120,16 @@ def test_what_is_damaged_is_compiled_again_and_said(
     caplog.clear()
     assert found(triple)
     assert not caplog.messages
+
+
+@pytest.mark.usefixtures("folder")
+def test_code_is_found_until_a_constant_of_its_file_changes(
+    triple: FunctionType, tmp_path: Path
+) -> None:
+    """The function itself stays the same, and so does what it returns."""
+    assert not found(triple)
+    assert found(triple)
+    assert not found(written(tmp_path / "own_triple.py", MODULE.replace("1.0, 2.0", "2.0, 1.0")))
 
 
 def test_a_damaged_part_is_missing_before_a_trial_asks_for_it(folder: Path) -> None:

@@ -310,38 +310,6 @@ def half(x):
 def plan(x, out):
     out[0] = half(x) + TABLE[1] + math.sqrt(4.0) + 0.0 * inner(out, out)
 """
-PROGRAM = """
-import numpy as np, sys
-from numba import float64, void
-from dopt.kernel.compiler import compiled_own
-from own import plan
-compiled = compiled_own(plan, void(float64, float64[::1]))
-out = np.zeros(1)
-compiled(10.0, out)
-print(len(compiled.stats.cache_hits), out[0])
-"""
-
-
-def answer(folder: Path, factor: float) -> tuple[int, float]:
-    """Return how often a process found the code in the cache, and what the code returned."""
-    (folder / "own.py").write_text(MODULE.format(factor=factor))
-    path = os.pathsep.join([str(ROOT), str(folder)])
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", PROGRAM],
-        env={**os.environ, "PYTHONPATH": path, "DOPT_CACHE": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    hits, value = done.stdout.split()
-    return int(hits), float(value)
-
-
-def test_a_process_finds_what_another_compiled_until_the_file_changes(tmp_path: Path) -> None:
-    assert answer(tmp_path, 0.5) == (0, 9.0)
-    assert answer(tmp_path, 0.5) == (1, 9.0)
-    assert answer(tmp_path, 2.0) == (0, 24.0)
 
 
 def function_with(folder: Path, **values: object) -> types.FunctionType:

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import os
 import pickle
 import re
-import subprocess
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,7 +29,6 @@ from tests.dopt.custom_networks import model_of_one
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.newcomers import kept
 from tests.dopt.trials import trial
-from tests.paths import ROOT
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -94,37 +89,14 @@ def test_no_two_systems_share_a_symbol() -> None:
     assert not set(symbols(Springy())[1:]) & set(shipped)
 
 
-def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) -> None:
-    program = (
-        "import os, sys, numpy as np\n"
-        "from dopt.kernel.equations import compiled_equations\n"
-        "from dopt.systems import SYSTEMS\n"
-        "def check(names):\n"
-        "    systems = [SYSTEMS[name]() for name in names]\n"
-        "    functions = [compiled_equations(system).known for system in systems]\n"
-        "    for system, known in zip(systems, functions):\n"
-        "        x, u = np.arange(1.0, 1 + system.n_states), np.ones(system.n_inputs)\n"
-        "        out, p = np.empty(system.n_states), system.parameters\n"
-        "        known(x, u, np.array(p), out)\n"
-        "        assert np.allclose(out, system.known(tuple(x), tuple(u), p)), system.name\n"
-        "for words in sys.argv[1:]:\n"  # each in a process that has compiled nothing
-        "    child = os.fork()\n"
-        "    if not child:\n"
-        "        check(words.split())\n"
-        "        os._exit(0)\n"
-        "    assert os.waitpid(child, 0)[1] == 0, words\n"
-    )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
-    names = ("pendulum", "cartpole", "cartpole pendulum", "pendulum cartpole")
-    command = [sys.executable, "-c", program, *names]
-    subprocess.run(command, check=True, env=environment, cwd=ROOT)
-
-
+FRESH = {"information": "fresh", "refresh_every": 4}
 CASES = [
     trial("pendulum", "d_optimal", 1, env={"horizon": 60}),
     trial("quadrotor", "d_optimal", 1, env={"horizon": 60}, policy={"form": "dual"}),
     trial("arm", "d_optimal", 1, env={"horizon": 60}, policy={"form": "sketch"}),
     trial("cartpole", "uniform", 1, env={"horizon": 60}),
+    trial("car", "gaussian_process", 1, env={"horizon": 60}),
+    trial("mass_spring", "d_optimal", 1, env={"horizon": 60}, policy=FRESH),
 ]
 
 

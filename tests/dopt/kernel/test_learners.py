@@ -22,7 +22,6 @@ from dopt.run import run_trial
 from dopt.spec.config import CRITERION_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from tests.close import assert_close
 from tests.dopt.custom_networks import model_of_one
 from tests.dopt.kernel.twin import model_of_kernel, observed, relative_gap
 from tests.dopt.oracles.traces import jacobian, model_step
@@ -64,8 +63,11 @@ def check_inverse(fast: KernelTrial, M: Array) -> None:
     if not isinstance(fast.spec.policy, InformationPolicy):
         assert fast.state.covariance.size == 0
         return
-    assert_close(
-        dense(fast.state.covariance) @ M, np.eye(len(M)), abs=min(1e-6, 1e-14 * np.linalg.cond(M))
+    np.testing.assert_allclose(
+        dense(fast.state.covariance) @ M,
+        np.eye(len(M)),
+        rtol=0.0,
+        atol=min(1e-6, 1e-14 * np.linalg.cond(M)),
     )
 
 
@@ -124,13 +126,6 @@ def test_between_two_fits_the_newest_sample_is_filtered() -> None:
     step = np.linalg.solve(M, J.T @ e / 0.5)
     assert after.state.theta - before.state.theta == pytest.approx(step, rel=1e-5, abs=1e-8)
     check_inverse(after, M)
-
-
-def test_a_prior_below_rounding_ends_the_trial_as_diverged() -> None:
-    spec = trial("arm", "random", 1, learner=GAUSS_NEWTON | {"regularization": 1e-300})
-    result = run_trial(spec)
-    assert result.diverged_at is not None
-    assert np.isnan(result.loss[result.diverged_at :]).all()
 
 
 def test_it_needs_the_primal_form_and_a_network() -> None:
@@ -221,7 +216,7 @@ def test_the_inverse_information_is_that_of_all_rows_of_the_learned_parameters(p
     columns = [spec.model.predict(spec.system, unit, states).ravel() for unit in units]
     J = np.stack(columns, axis=1)
     M = (1e-2 if policy == "d_optimal" else 3e-2) * np.eye(60) + J.T @ J
-    assert_close(dense(fast.state.covariance) @ M, np.eye(60), abs=1e-8)
+    np.testing.assert_allclose(dense(fast.state.covariance) @ M, np.eye(60), rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("env", ["pendulum", "arm", "quadrotor"])

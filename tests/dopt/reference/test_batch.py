@@ -13,7 +13,6 @@ from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
 from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.models import uniform_inputs
-from tests.close import assert_close
 from tests.dopt.custom_networks import for_one
 from tests.dopt.reference.test_reference import situation, sphere, step_from
 from tests.dopt.trials import KNOWN_EFFECT, PAIRS, covering, trial
@@ -95,7 +94,7 @@ def test_information_is_the_prior_and_all_rows_after_each_learning_step() -> Non
             expected += rows.T @ rows
     assert batch.information is not None
     solved = batch.information.solve(torch.tensor(expected)[None])[0].numpy()
-    assert_close(solved, np.eye(len(expected)), rel=0.0, abs=1e-5)
+    np.testing.assert_allclose(solved, np.eye(len(expected)), rtol=0.0, atol=1e-5)
 
 
 def _differences(batch: Lockstep, x: torch.Tensor) -> np.ndarray:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import pickle
-import sys
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +35,6 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.custom_networks import Stack, for_one
 from tests.dopt.trials import PAIRS, SMALL_SEARCHES, trial
-from tests.paths import EXAMPLE
 
 
 class Situation(NamedTuple):
@@ -158,9 +155,6 @@ def test_the_problem_is_made_of_finite_differences_of_the_gradient(env: str, pol
         assert torch.allclose(v, -DB.mT @ inverse @ g, rtol=0.0, atol=1e-6 * scale)
 
 
-MODELS = ["mlp", "linear"]
-
-
 def test_a_model_whose_slope_is_free_of_its_parameters_does_not_change_its_gradient() -> None:
     """A = x₁ + θ: neither the slope nor the gradient holds the other."""
 
@@ -273,15 +267,9 @@ HERE = "tests.dopt.custom_networks"
 def specification(
     target: str = "Stack", seed: int = 0, policy: str = "d_optimal", **arguments: Any
 ) -> TrialSpec:
-    return TrialSpec.from_mapping(
-        {
-            "env": {"name": "cartpole", "horizon": 20, "grid_points": [3, 4, 3]},
-            "policy": {"name": policy},
-            "model": {"_target_": target if "." in target else f"{HERE}.{target}", **arguments},
-            "learner": {"name": "adam_window"},
-            "seed": seed,
-        }
-    )
+    env = {"name": "cartpole", "horizon": 20, "grid_points": [3, 4, 3]}
+    model = {"_target_": target if "." in target else f"{HERE}.{target}", **arguments}
+    return TrialSpec.from_names(env, policy, model=model, seed=seed)
 
 
 @pytest.mark.parametrize("env", SYSTEMS)
@@ -349,23 +337,6 @@ def test_the_trial_comes_back_from_its_mapping_and_from_another_process() -> Non
     assert spec.config.path == "reference"
     assert spec.columns()["model"] == "Stack"
     assert spec.trial_key != specification(width=8).trial_key
-
-
-def test_another_state_of_its_file_is_another_trial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    before = specification("networks.Residual")
-    text = (EXAMPLE / "networks.py").read_text()
-    (tmp_path / "networks.py").write_text(text + "\n# changed\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    sys.modules.pop("networks")
-    after = specification("networks.Residual")
-    sys.modules.pop("networks")
-    assert after.trial_key != before.trial_key
-    with pytest.raises(SpecificationError, match="another state of its file"):
-        TrialSpec.from_mapping(before.to_mapping())
-    assert "networks" not in sys.modules, "the other file has not run"
 
 
 @pytest.mark.parametrize(

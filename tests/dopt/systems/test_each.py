@@ -221,12 +221,12 @@ def slope(function: Function, x: float) -> float:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.parametrize("x", POINTS)
-def test_a_complex_step_takes_the_derivative(name: str, x: float) -> None:
+def test_a_complex_step_takes_the_derivative(name: str) -> None:
     function, step = FUNCTIONS[name], 1e-30
-    for value in (np.complex128(x + 1j * step), np.array([x + 1j * step])):
-        found = np.asarray(function(value)).imag / step
-        assert float(np.ravel(found)[0]) == pytest.approx(slope(function, x), abs=1e-8)
+    for x in POINTS:
+        for value in (np.complex128(x + 1j * step), np.array([x + 1j * step])):
+            found = np.asarray(function(value)).imag / step
+            assert float(np.ravel(found)[0]) == pytest.approx(slope(function, x), abs=1e-8)
 
 
 def test_the_sign_of_zero_is_zero_and_of_nan_is_nan() -> None:

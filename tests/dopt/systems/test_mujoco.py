@@ -76,15 +76,9 @@ class TwoActuators(Block):
 def specification(
     env: str = "mujoco_pendulum", policy: str = "random", seed: int = 0, **fields: Any
 ) -> TrialSpec:
-    return TrialSpec.from_mapping(
-        {
-            "env": {"name": env, **fields},
-            "policy": {"name": policy},
-            "model": {"name": "affine", "width": 8},
-            "learner": {"name": "gauss_newton"},
-            "seed": seed,
-        }
-    )
+    model = {"name": "affine", "width": 8}
+    section = {"name": env, **fields}
+    return TrialSpec.from_names(section, policy, model=model, learner="gauss_newton", seed=seed)
 
 
 def points(system: BlackBox, n: int = 200) -> tuple[Array, Array]:

@@ -62,11 +62,6 @@ class TestUpgrade:
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
 
-    def test_of_an_empty_file(self, command: Run, url: str) -> None:
-        _path(url).parent.mkdir()
-        _path(url).touch()
-        assert f"was empty and has schema {SCHEMA_VERSION} now" in command("upgrade").out
-
 
 def _path(url: str) -> Path:
     return Path(str(make_url(url).database))

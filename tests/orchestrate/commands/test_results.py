@@ -130,23 +130,18 @@ class TestOnEveryDatabase:
         assert code == ExitCode.INFRASTRUCTURE
         assert "hunter2" not in sentence
 
-    def test_a_newer_database(
+    def test_a_newer_and_an_older_database(
         self, words: list[str], url: str, store: Store, capsys: Capture
     ) -> None:
-        with store._backend.transaction() as connection:
-            connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-        code, sentence = refusal([*words, "--db", url], capsys)
-        assert code == ExitCode.BAD_REQUEST
-        assert "update the program" in sentence
-
-    def test_an_older_database(
-        self, words: list[str], url: str, store: Store, capsys: Capture
-    ) -> None:
-        with store._backend.transaction() as connection:
-            connection.exec_driver_sql("UPDATE alembic_version SET version_num = '5'")
-        code, sentence = refusal([*words, "--db", url], capsys)
-        assert code == ExitCode.BAD_REQUEST
-        assert "python -m orchestrate upgrade --db" in sentence
+        for version, said in (
+            (9999, "update the program"),
+            (5, "python -m orchestrate upgrade --db"),
+        ):
+            with store._backend.transaction() as connection:
+                connection.exec_driver_sql(f"UPDATE alembic_version SET version_num = '{version}'")
+            code, sentence = refusal([*words, "--db", url], capsys)
+            assert code == ExitCode.BAD_REQUEST
+            assert said in sentence
 
     def test_an_empty_database(
         self,
@@ -166,15 +161,6 @@ class TestOnEveryDatabase:
         if not refused:
             assert main([*words, "--json", "--db", url]) == 0
             json.loads(capsys.readouterr().out)
-
-
-def test_the_database_comes_from_the_environment(
-    sqlite_url: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    Store.open(sqlite_url).close()
-    monkeypatch.setenv("DOPT_DB", sqlite_url)
-    assert main(["status"]) == 0
-    assert f"{sqlite_url} holds no trials yet" in capsys.readouterr().out
 
 
 def test_the_entry_point_is_the_same_program(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -302,16 +288,6 @@ def test_what_is_refused_is_one_sentence(ask: Run) -> None:
     answer = ask("query", endless, "--timeout", "0.2")
     assert answer.code == 2
     assert "longer than 0.2 s" in answer.err
-
-
-@on_both
-def test_no_text_of_the_database_drives_the_terminal(ask: Run) -> None:
-    sql = "SELECT chr(27) || '[31m' AS x" if _is_postgresql(ask) else "SELECT char(27, 91) AS x"
-    assert "\x1b" not in ask("query", sql).out
-
-
-def _is_postgresql(ask: Run) -> bool:
-    return str(ask("status", "--json").document["database"]).startswith("postgresql")
 
 
 def test_a_done_trial(ask: Run) -> None:

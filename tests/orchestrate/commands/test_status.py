@@ -386,23 +386,6 @@ def test_a_worker_that_can_run_no_trial_hands_back_what_it_holds(
     assert pull("work")[0] == 0
 
 
-def test_results_that_come_too_late_are_counted(
-    command_line: Launch, pull: Launch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command_line(*GRID, LEAVE)
-    commit = Store.commit_many
-
-    def late(store: Store, results: Sequence[tuple[Claim, object, object]]) -> list[bool]:
-        store.release(results[0][0].launch)
-        return commit(store, results)  # type: ignore[arg-type]
-
-    calls = iter([late])
-    monkeypatch.setattr(Store, "commit_many", lambda *words: next(calls, commit)(*words))
-    _, out, _ = pull("work")
-    assert "results refused: the lease had run out" in out
-    assert "4 trials done" in out
-
-
 def test_a_trial_that_was_taken_away_is_not_run_twice_at_once(
     command_line: Launch, pull: Launch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -444,21 +427,6 @@ def test_a_launch_that_left_and_is_repeated_says_what_is_done(
     assert "4 of 6 already done, 2 registered" in said
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("env=pendulum", LEAVE), "launch.detach is for grids"),
-        ((*GRID, LEAVE, "launch.until=ci<5%"), "leave one of the two out"),
-    ],
-)
-def test_what_does_not_go_with_leaving_is_refused(
-    command_line: Launch, words: tuple[str, ...], named: str
-) -> None:
-    code, _, err = command_line(*words)
-    assert code == 2
-    assert named in err
-
-
 def test_a_worker_ends_when_the_rest_cannot_run_here(
     command_line: Launch, pull: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -468,13 +436,6 @@ def test_a_worker_ends_when_the_rest_cannot_run_here(
     assert code == 3
     assert "6 left" in out
     assert "3 trials are left to other workers" in err
-
-
-def test_a_worker_makes_no_database(pull: Launch, tmp_path: Path) -> None:
-    code, _, err = pull("work")
-    assert code == 2
-    assert "error: " in err
-    assert not (tmp_path / "results").exists()
 
 
 @pytest.mark.parametrize(

@@ -97,12 +97,6 @@ def test_damage_is_found(grid: str, harms: str, severity: str, words: str, count
     assert found.advice
 
 
-def test_rows_of_trials_without_a_result(grid: str) -> None:
-    harm(grid, "UPDATE trial SET status = 'pending' WHERE trial_id = 1")
-    sentences = " ".join(one.sentence for one in examine(grid, key))
-    assert "unfinished trials with steps, a trajectory or assessments: 1" in sentences
-
-
 @pytest.mark.parametrize(
     ("harms", "words"),
     [

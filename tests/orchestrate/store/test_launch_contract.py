@@ -94,12 +94,6 @@ class TestClaims:
         assert store.claim(launch, ["0" * 64]) == []
         assert store.claim(launch, []) == []
 
-    def test_count_attempts(self, store: Store, launch: int, take: Take) -> None:
-        (first,) = take(Spec())
-        assert store.release(launch) == 1
-        (second,) = take(Spec())
-        assert (first.attempt, second.attempt) == (1, 2)
-
     def test_are_released_one_by_one(self, store: Store, launch: int, take: Take) -> None:
         one, two = take(Spec(1), Spec(2))
         assert store.release(launch, [one.trial_key]) == 1

@@ -284,14 +284,6 @@ def assess(url: str, *several: Spec) -> None:
     run_all(url, *several, make=lambda one: assessed(one.seed))
 
 
-def test_assessments_come_with_their_trials(url: str, other: str) -> None:
-    assess(other, Spec(0), Spec(1))
-    assert merge(url, other).added == {"done": 2}
-    assert everything(url) == everything(other)
-    again = merge(url, other)
-    assert (again.identical, again.conflicts) == (2, [])
-
-
 @pytest.mark.parametrize("damage", ["DELETE FROM assessment WHERE t = 3", "DELETE FROM assessment"])
 def test_a_trial_that_lost_assessments_does_not_come(url: str, other: str, damage: str) -> None:
     assess(other, Spec(0), Spec(1))

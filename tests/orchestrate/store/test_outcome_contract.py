@@ -95,14 +95,6 @@ class TestCommit:
             store.commit(claim, sent, RUN)
         assert reader.rows("SELECT * FROM assessment") == []
 
-    def test_writes_no_assessment_without_its_claim(
-        self, store: Store, launch: int, take: Take, reader: Reader
-    ) -> None:
-        (claim,) = take(Spec())
-        store.release(launch)
-        assert not store.commit(claim, assessed(), RUN)
-        assert reader.rows("SELECT * FROM assessment") == []
-
     @pytest.mark.parametrize("horizon", [1, 99, 100, 101, 250])
     def test_numbers_the_steps(
         self, store: Store, take: Take, reader: Reader, horizon: int
@@ -207,8 +199,9 @@ class TestFence:
         store.release(launch)
         owner = launch if again == "same launch" else store.begin_launch(LAUNCH)
         (claim,) = store.claim(owner, [late.trial_key])
-        assert not store.commit(late, result(1), RUN)
+        assert not store.commit(late, assessed(1), RUN)
         assert reader.rows("SELECT * FROM step") == []
+        assert reader.rows("SELECT * FROM assessment") == []
         assert store.commit(claim, result(2), RUN)
         np.testing.assert_array_equal(reader.curves(Spec().config_key).values[0], result(2).loss)
 

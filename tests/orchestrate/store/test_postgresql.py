@@ -66,16 +66,12 @@ def test_claims_are_free_after_the_lease(
     assert reader.rows("SELECT state, ended FROM launch")[0].state == "running"
 
 
-def test_a_heartbeat_renews_the_lease(store: Store, sleeper: tuple[Store, int, Claim]) -> None:
+@pytest.mark.parametrize("renew", [Store.heartbeat, lambda late, launch: late.claim(launch, [])])
+def test_a_heartbeat_or_a_claim_renews_the_lease(
+    store: Store, sleeper: tuple[Store, int, Claim], renew: Callable[[Store, int], object]
+) -> None:
     late, launch, claim = sleeper
-    late.heartbeat(launch)
-    assert store.recover() == 0
-    assert late.commit(claim, result(), RUN)
-
-
-def test_a_claim_renews_the_lease(store: Store, sleeper: tuple[Store, int, Claim]) -> None:
-    late, launch, claim = sleeper
-    assert late.claim(launch, []) == []
+    renew(late, launch)
     assert store.recover() == 0
     assert late.commit(claim, result(), RUN)
 
@@ -93,8 +89,9 @@ def test_an_ended_connection_costs_one_error(
         insert_steps(*arguments)  # type: ignore[arg-type]
 
     store._backend.insert_steps = cut  # type: ignore[method-assign]
-    with pytest.raises(StoreUnavailableError, match="server runs and answers"):
+    with pytest.raises(StoreUnavailableError, match="server runs and answers") as caught:
         store.commit(claim, result(), RUN)
+    assert caught.value.transient
     store._backend.insert_steps = insert_steps  # type: ignore[method-assign]
     assert store.commit(claim, result(), RUN)
     store.end_launch(launch, "done")
@@ -395,22 +392,6 @@ def test_a_refused_login(postgresql_url: str, wrong: str, reason: str) -> None:
     assert not caught.value.transient
 
 
-def _end_own_backend(store: Store, other: Store) -> None:
-    with store._backend.transaction() as connection:
-        pid = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
-        with other._backend.transaction() as ends:
-            ends.exec_driver_sql(f"SELECT pg_terminate_backend({pid})")
-        connection.exec_driver_sql("SELECT 1")
-
-
-def test_a_connection_that_an_administrator_ended(postgresql_url: str) -> None:
-    with Store.open(postgresql_url) as store, Store.open(postgresql_url) as other:
-        with pytest.raises(StoreUnavailableError) as caught:
-            _end_own_backend(store, other)
-        assert caught.value.transient
-        assert store.begin_launch(LAUNCH) == 1
-
-
 def _write_read_only(store: Store) -> None:
     with store._backend.transaction() as connection:
         connection.exec_driver_sql("SET TRANSACTION READ ONLY")
@@ -445,18 +426,6 @@ def test_codes_of_the_server(state: str, expected: bool) -> None:
 )
 def test_words_of_the_server_while_a_connection_is_made(text: str, expected: bool) -> None:
     assert is_transient(psycopg.OperationalError(text), known_host=False) is expected
-
-
-def test_a_lock_that_another_process_holds(tmp_path: Path) -> None:
-    path = tmp_path / "results.db"
-    with Store.open(f"sqlite:///{path}", patience=0.1) as store:
-        other = sqlite3.connect(path, isolation_level=None)
-        other.execute("BEGIN IMMEDIATE")
-        with pytest.raises(StoreUnavailableError, match="locked") as caught:
-            store.begin_launch(LAUNCH)
-        other.close()
-        assert not caught.value.transient, "it was waited for with all patience"
-        assert store.begin_launch(LAUNCH) == 1
 
 
 @pytest.mark.parametrize("transient", [False, True])

@@ -37,6 +37,11 @@ ESCAPES = (
     "DROP VIEW v_trial",
     "COMMIT; DROP VIEW v_trial",
     "COMMIT; CREATE TABLE more (x INTEGER)",
+    "UPDATE trial SET seed = 1",
+    "INSERT INTO trial SELECT * FROM trial",
+    "DROP TABLE step",
+    "BEGIN",
+    "VACUUM",
 )
 SQLITE_ESCAPES = (
     "ATTACH DATABASE '{other}' AS other",
@@ -48,6 +53,9 @@ SQLITE_ESCAPES = (
     "PRAGMA cache_size = -1000000",
     "PRAGMA journal_mode = DELETE",
     "UPDATE sqlite_master SET sql = ''",
+    "PRAGMA writable_schema = 1",
+    "PRAGMA temp_store_directory = '/tmp'",
+    "SELECT edit('x')",
 )
 POSTGRESQL_ESCAPES = (
     "SET default_transaction_read_only = off; COMMIT; DELETE FROM step",
@@ -58,6 +66,11 @@ POSTGRESQL_ESCAPES = (
     "COPY (SELECT 1) TO STDOUT",
     "SELECT nextval('launch_launch_id_seq')",
     "SELECT * FROM step FOR UPDATE",
+    "COPY trial FROM '/etc/passwd'",
+    "SET default_transaction_read_only = off",
+    "SET SESSION CHARACTERISTICS AS TRANSACTION READ WRITE",
+    "SELECT set_config('transaction_read_only', 'off', true)",
+    "LISTEN x",
 )
 
 

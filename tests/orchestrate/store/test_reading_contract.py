@@ -22,7 +22,6 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.store.databases import new_schema
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, diverged, result
 
@@ -223,9 +222,6 @@ class TestOpening:
     def test_an_empty_schema_is_no_database(self, postgresql_url: str) -> None:
         with pytest.raises(SchemaVersionError, match="no table 'alembic_version'"):
             Reader.open(postgresql_url)
-
-    def test_shows_the_version(self, reader: Reader) -> None:
-        assert reader.schema_version() == str(SCHEMA_VERSION)
 
     @pytest.mark.parametrize("side", [Store, Reader])
     @pytest.mark.parametrize(

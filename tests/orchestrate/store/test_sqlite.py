@@ -20,7 +20,6 @@ from sqlalchemy.engine import make_url
 from orchestrate.store import (
     Claim,
     Reader,
-    SchemaVersionError,
     Store,
     StoreError,
     StoreUnavailableError,
@@ -122,16 +121,6 @@ def test_a_transaction_locks_before_it_reads(store: Store, path: Path) -> None:
     other.close()
 
 
-def test_a_closed_store_counts_as_dead(store: Store, url: str) -> None:
-    with Store.open(url) as other:
-        launch = other.begin_launch(LAUNCH)
-        other.claim(launch, other.register(launch, [Spec()]).todo)
-        assert store.recover() == 0
-    assert store.recover() == 1
-    with Reader.open(url) as reader:
-        assert reader.rows("SELECT state FROM launch")[0].state == "lost"
-
-
 def test_locks_of_launches_that_ended_are_cleared_away(store: Store, path: Path) -> None:
     folder = path.with_name("results.db-locks")
     launch = store.begin_launch(LAUNCH)
@@ -154,6 +143,8 @@ def test_a_forked_worker_does_not_keep_the_launch_alive(store: Store, url: str) 
         assert store.recover() == 0
         other.close()  # as the kernel does when the parent dies
         assert store.recover() == 1
+        with Reader.open(url) as reader:
+            assert reader.rows("SELECT state FROM launch")[0].state == "lost"
     finally:
         os.close(wakes)
         os.close(waits)
@@ -203,16 +194,6 @@ def test_a_path_may_hold_any_character(tmp_path: Path) -> None:
     assert path.is_file()
 
 
-@pytest.mark.parametrize("side", [Store, Reader])
-def test_refuses_a_file_that_is_no_database(tmp_path: Path, side: type[Store | Reader]) -> None:
-    path = tmp_path / "notes.db"
-    path.write_text("Some notes, long enough to be taken for a header of a database. " * 4)
-    before = path.read_bytes()
-    with pytest.raises(SchemaVersionError, match="is not a SQLite database, but a results"):
-        side.open(f"sqlite:///{path}")
-    assert path.read_bytes() == before
-
-
 @pytest.mark.parametrize("side", ["store", "reader"])
 def test_a_file_that_is_no_database_any_more_is_damaged(tmp_path: Path, side: str) -> None:
     """Whoever has opened it gave the right file: it is damaged, which another copy may mend."""
@@ -227,16 +208,6 @@ def test_a_file_that_is_no_database_any_more_is_damaged(tmp_path: Path, side: st
         with pytest.raises(StoreUnavailableError, match="not a SQLite database any more") as lost:
             begin(store) if side == "store" else reader.configs()
     assert not lost.value.transient
-
-
-@pytest.mark.parametrize("side", [Store, Reader])
-def test_refuses_the_database_of_something_else(tmp_path: Path, side: type[Store | Reader]) -> None:
-    path = tmp_path / "other.db"
-    connection = sqlite3.connect(path)
-    connection.execute("CREATE TABLE album (title TEXT)")
-    connection.close()
-    with pytest.raises(SchemaVersionError, match="not a results database"):
-        side.open(f"sqlite:///{path}")
 
 
 @pytest.mark.parametrize(
@@ -274,14 +245,6 @@ def test_a_full_disk_loses_nothing_committed(
     with store._backend.engine.connect() as connection:
         connection.connection.driver_connection.execute("PRAGMA max_page_count = 1000000")  # type: ignore[union-attr]
     assert store.commit(two, result(horizon=5_000), RUN)
-
-
-def test_an_integer_column_refuses_bytes(path: Path, store: Store) -> None:
-    assert store.recover() == 0
-    connection = sqlite3.connect(path)
-    with pytest.raises(sqlite3.IntegrityError, match="cannot store BLOB"):
-        connection.execute("INSERT INTO step (trial_id, t) VALUES (1, ?)", (b"12345678",))
-    connection.close()
 
 
 def test_reads_a_medium_where_nothing_can_be_written(
@@ -558,11 +521,7 @@ def test_a_long_reader_holds_up_nobody_and_the_log_shrinks_afterwards(
                 assert store.commit(claim, result(0, 300), RUN)
             assert len(moment.rows("SELECT * FROM step")) == 300
             assert wal.stat().st_size > 4 * limit
-        _commit(store, claims[-2:])
+        for claim in claims[-2:]:
+            assert store.commit(claim, result(0, 300), RUN)
         assert wal.stat().st_size <= limit + 2 * 300 * 100
         assert len(reader.rows("SELECT * FROM step")) == 120 * 300
-
-
-def _commit(store: Store, claims: list[Claim]) -> None:
-    for claim in claims:
-        assert store.commit(claim, result(0, 300), RUN)
