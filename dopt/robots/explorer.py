@@ -19,7 +19,7 @@ from dopt.errors import ExplorationError, SpecificationError, unknown_name
 from dopt.robots.body import Body, Motion
 from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
 from dopt.robots.limits import Limits
-from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.tracking import Guard, KnownBody, Tracker, possible_acceleration
 from dopt.robots.windows import window_size
 from dopt.sphere import sphere_maximizer
 from dopt.types import Array
@@ -135,6 +135,7 @@ class RobotExplorer:
         self.known = KnownBody(self.body)
         possible, inertia = possible_acceleration(self.known, limits)
         self.acceleration = USED * possible
+        self._guard = Guard(self.body, limits, self.acceleration)
         self.learner = FrictionLearner(
             limits,
             self.known.inverse,
@@ -149,7 +150,8 @@ class RobotExplorer:
         self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
         n = self.body.n
         self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
-        self.counts = {"bad": 0, "late": 0, "plans": 0, "windows": 0, "changed": 0}
+        self._wary = np.zeros(n, dtype=bool)  # since all have braked before a contact
+        self.counts = {"bad": 0, "late": 0, "near": 0, "plans": 0, "windows": 0, "changed": 0}
         self.warnings: list[str] = []
         self.steps, self._wrong, self._asked = 0, 0, False
         self._rows: list[tuple[Array, ...]] = []
@@ -281,11 +283,24 @@ class RobotExplorer:
         v = self._v + a * self.dt
         rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
         blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
-        a = np.where(blocked, np.clip(-self._v / self.dt, -most, most), a)
+        brake = np.clip(-self._v / self.dt, -most, most)
+        a = np.where(blocked, brake, a)
+        v = self._v + a * self.dt
+        if not self._guard.free(self._q + self.dt * v, v, self._q):
+            a = brake
+            self._rest()
         self._a, self._v = a, self._v + a * self.dt
         self._q = self._q + self.dt * self._v
         reached = np.abs(self._v - self._target) < 1e-9
-        self._hold = np.where(blocked, 0.0, self._hold - self.dt * reached)
+        ended = blocked & ~self._wary
+        self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
+
+    def _rest(self) -> None:
+        """Let all joints brake, and plan one after another when the last one is at rest."""
+        self.counts["near"] += 1
+        stop = np.abs(self._v) / self.acceleration
+        self._target[:], self._wary[:] = 0.0, True
+        self._hold = stop.max() - stop + self.dt * np.arange(1, len(stop) + 1)
 
     def _segment(self, j: int) -> tuple[float, float]:
         """Return the speed and the time for which joint j keeps it with the largest gain a second.
@@ -303,8 +318,11 @@ class RobotExplorer:
         room = (end - start - u * np.abs(u) / (2.0 * most)) / u
         hold = np.minimum(hold, room)
         fits = hold >= least
+        if self._wary[j]:
+            fits &= np.where(u < 0.0, *self._guard.open(self._q, j))
         if not fits.any():
-            return 0.0, 0.0
+            return 0.0, float(self._wary[j] * least)
+        self._wary[j] = False
         speeds, start, hold, rising = speeds[fits], start[fits], hold[fits], rising[fits]
         rows = learner.model.jacobian(
             np.broadcast_to(learner.mean[j : j + 1, :p], (1, p)), speeds[None]
@@ -349,14 +367,20 @@ class RobotExplorer:
         Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)
         v = -D.T @ (J * weighed).sum(axis=1)
         chosen = self._maximize(Q, v, self._gamma, self._tie)
-        a = idle + inverse @ (chosen * limits.torque)
-        after = tracker.v + self.dt * a
-        rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
-        outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
-        guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
-        if guarded.any():
-            brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
+        brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
+        for part in (chosen, -chosen):
+            a = idle + inverse @ (part * limits.torque)
+            after = tracker.v + self.dt * a
+            rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
+            outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
+            guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
             a = np.where(guarded, brake, a)
+            after = tracker.v + self.dt * a
+            if self._guard.free(tracker.q + self.dt * after, after, tracker.q):
+                break
+        else:
+            a = brake
+            self.counts["near"] += 1
         self._a = a
         demand = mass @ self._a + bias + friction
         self._q, self._v = tracker.q.copy(), tracker.v.copy()
