@@ -155,7 +155,8 @@ class RobotExplorer:
         self.warnings: list[str] = []
         self.steps, self._wrong, self._asked = 0, 0, False
         self._rows: list[tuple[Array, ...]] = []
-        self._recent: deque[Array] = deque(maxlen=RECENT)
+        self._recent: deque[tuple[Any, ...]] = deque(maxlen=RECENT)
+        self._unsure: Array | None = None  # covariance of the payload's mass and first moment
         self._payload: list[tuple[Any, ...]] | None = None
         self._since = 0  # windows since the body was last known to change
         self._done = False
@@ -401,7 +402,9 @@ class RobotExplorer:
                 self._lift(self._payload)
             return
         before = self.learner.feedforward(self._v)
-        self._recent.append(self.learner.learn(means, rates) / np.sqrt(self.learner.inflation))
+        standard = self.learner.learn(means, rates)
+        wider = np.sqrt(self.learner.inflation)
+        self._recent.append((standard / wider, self.learner.unit * wider, means))
         self._q = self._q - self._tracker.lag(self.learner.feedforward(self._v) - before)
         if self._changed():
             self.counts["changed"] += 1
@@ -423,10 +426,24 @@ class RobotExplorer:
         few = len(self._recent) < RECENT or self._since < 3 * RECENT
         if few or self.inputs == "torques":
             return False
-        recent = np.array(self._recent)
-        known = np.isfinite(recent)
-        sums = np.where(known, recent, 0.0).sum(axis=0) ** 2 / np.maximum(known.sum(axis=0), 1)
-        return bool(sums.sum() > self._alarm)
+        standard, unit = (np.array([row[i] for row in self._recent]) for i in range(2))
+        known = np.isfinite(standard)
+        size = np.sqrt(np.maximum(known.sum(axis=0), 1))
+        sums = np.where(known, standard, 0.0).sum(axis=0) / size
+        if self._unsure is None or sums @ sums <= self._alarm:
+            return bool(sums @ sums > self._alarm)
+        # What a payload that was weighed may weigh more or less is no change.
+        rows = self._carried([row[2] for row in self._recent]) * (known / unit)[..., None]
+        rows = rows.sum(axis=0) / size[:, None]
+        spread = np.eye(len(sums)) + rows @ self._unsure @ rows.T
+        return bool(sums @ np.linalg.solve(spread, sums) > self._alarm)
+
+    def _carried(self, windows: list[tuple[Array, ...]]) -> Array:
+        """Return torques by mass and first moment on the last body, (k, n, 4), parts of limits."""
+        q, v, a = (np.array([means[i] for means in windows]) for i in range(3))
+        rows = self.body.regressor(Motion(self.learner.window.seconds, q, v, a))[:, :, -10:-6]
+        result: Array = rows / self.limits.torque[:, None]
+        return result
 
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
@@ -434,15 +451,14 @@ class RobotExplorer:
         Columns of the regressor, less friction and ripple as they are known, weighed by the noise.
         """
         learner = self.learner
-        q, v, a = (np.array([means[i] for means, _ in windows]) for i in range(3))
-        own = self.body.regressor(Motion(learner.window.seconds, q, v, a))[:, :, -10:-6]
         missing = np.array([learner.innovations(*window)[0] for window in windows])
         moving = np.isfinite(missing)
         weights = moving / learner.noise
-        design = own / self.limits.torque[:, None] * weights[..., None]
-        found, *_ = np.linalg.lstsq(
-            design.reshape(-1, 4), (np.nan_to_num(missing) * weights).reshape(-1), rcond=1e-6
-        )
+        rows = self._carried([means for means, _ in windows]) * weights[..., None]
+        design, wanted = rows.reshape(-1, 4), (np.nan_to_num(missing) * weights).ravel()
+        found, *_ = np.linalg.lstsq(design, wanted, rcond=1e-6)
+        misfit = ((wanted - design @ found) ** 2).sum() / max(moving.sum() - 4, 1)
+        self._unsure = misfit * np.linalg.inv(design.T @ design + 1e-6 * np.eye(4))
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)
