@@ -291,15 +291,6 @@ class Contacts:
         for a, b in (pairs.T, pairs.T[::-1]):
             np.minimum.at(self._kept, (a, b), at_home)
 
-    @property
-    def possible(self) -> bool:
-        """Whether any two geoms of bodies that count can collide."""
-        model, (a, b) = self._model, np.triu_indices(self._model.ngeom, 1)
-        collide = model.geom_contype[a] & model.geom_conaffinity[b]
-        collide |= model.geom_contype[b] & model.geom_conaffinity[a]
-        counted = np.isfinite(self._kept[model.geom_bodyid[a], model.geom_bodyid[b]])
-        return bool((collide.astype(bool) & counted).any() or model.npair)
-
     def _pass(self, positions: Array) -> tuple[npt.NDArray[np.int32], Array]:
         """Return the bodies of each contact, (k, 2), and their distances, (k,) [m]."""
         data = self._data

@@ -51,6 +51,9 @@ LIFTED = 2.0
 LOST = 50
 """Measurements in turn that make no sense, after which the next is believed."""
 
+AWAY = 1.0
+"""Seconds for which references lead away from a contact that torques came near."""
+
 INPUTS = ("references", "torques")
 
 _log = logging.getLogger("dopt.robots")
@@ -72,6 +75,7 @@ class RobotExplorer:
     one that narrows the widest intervals of its friction curve most a second; ripple is a
     nuisance.
     With ``inputs="torques"``, the torques of each period are the paper's D-optimal step.
+    All joints brake before contacts of bodies that do not touch at home, and are then led away.
 
     Parameters
     ----------
@@ -150,7 +154,7 @@ class RobotExplorer:
         self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
         n = self.body.n
         self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
-        self._wary = np.zeros(n, dtype=bool)  # since all have braked before a contact
+        self._wary, self._away = np.zeros(n, dtype=bool), 0.0  # since a contact was near
         self.counts = {"bad": 0, "late": 0, "near": 0, "plans": 0, "windows": 0, "changed": 0}
         self.warnings: list[str] = []
         self.steps, self._wrong, self._asked = 0, 0, False
@@ -188,9 +192,10 @@ class RobotExplorer:
             self._begin(measured)
         self._check_time(time)
         trusted = self._observe(measured)
-        if self.inputs == "torques" and trusted and not self._done:
-            torque = self._torques()
-        else:
+        self._away -= self.dt
+        leads = self.inputs == "references" or self._away > 0.0 or not trusted or self._done
+        torque = None if leads else self._torques()
+        if torque is None:
             self._advance(trusted, began + self._deadline)
             torque = self._tracker.torque(self._q, self._v, self._a)
         self._asked, self._torque = True, torque
@@ -288,10 +293,9 @@ class RobotExplorer:
         a = np.where(blocked, brake, a)
         v = self._v + a * self.dt
         if not self._guard.free(self._q + self.dt * v, v, self._q):
-            a = brake
+            a, v = brake, self._v + brake * self.dt
             self._rest()
-        self._a, self._v = a, self._v + a * self.dt
-        self._q = self._q + self.dt * self._v
+        self._a, self._v, self._q = a, v, self._q + self.dt * v
         reached = np.abs(self._v - self._target) < 1e-9
         ended = blocked & ~self._wary
         self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
@@ -346,8 +350,8 @@ class RobotExplorer:
 
     # Torques: the paper's step.
 
-    def _torques(self) -> Array:
-        """Return torques on the ball that maximise the linearised gain, or brake.
+    def _torques(self) -> Array | None:
+        """Return torques on the ball that maximise the linearised gain; None before a contact.
 
         The state moves q̇ first: with δ = dt M⁻¹ u the gain Σ_j (J_j + δ_j ∂J_j)ᵀ P_j (·) is
         quadratic, with Q = dt² M⁻ᵀ diag(∂JᵀP∂J) M⁻¹ and v = -dt M⁻ᵀ (JᵀP∂J).
@@ -368,23 +372,22 @@ class RobotExplorer:
         Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)
         v = -D.T @ (J * weighed).sum(axis=1)
         chosen = self._maximize(Q, v, self._gamma, self._tie)
-        brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
-        for part in (chosen, -chosen):
-            a = idle + inverse @ (part * limits.torque)
-            after = tracker.v + self.dt * a
-            rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
-            outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
-            guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
+        a = idle + inverse @ (chosen * limits.torque)
+        after = tracker.v + self.dt * a
+        rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
+        outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
+        guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
+        if guarded.any():
+            brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
             a = np.where(guarded, brake, a)
-            after = tracker.v + self.dt * a
-            if self._guard.free(tracker.q + self.dt * after, after, tracker.q):
-                break
-        else:
-            a = brake
-            self.counts["near"] += 1
         self._a = a
-        demand = mass @ self._a + bias + friction
         self._q, self._v = tracker.q.copy(), tracker.v.copy()
+        after = tracker.v + self.dt * a
+        if not self._guard.free(tracker.q + self.dt * after, after, tracker.q):
+            self._rest()
+            self._away = AWAY
+            return None
+        demand = mass @ self._a + bias + friction
         torque: Array = np.minimum(np.maximum(demand, -limits.torque), limits.torque)
         return torque
 
@@ -403,8 +406,8 @@ class RobotExplorer:
             return
         before = self.learner.feedforward(self._v)
         standard = self.learner.learn(means, rates)
-        wider = np.sqrt(self.learner.inflation)
-        self._recent.append((standard / wider, self.learner.unit * wider, means))
+        wide = np.sqrt(self.learner.inflation)
+        self._recent.append((standard / wide, self.learner.unit * wide, means))
         self._q = self._q - self._tracker.lag(self.learner.feedforward(self._v) - before)
         if self._changed():
             self.counts["changed"] += 1

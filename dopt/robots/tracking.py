@@ -17,13 +17,11 @@ BANDWIDTH = 40.0
 CORRECTION = 0.5, 0.1
 """Parts of an innovation that correct the observed position, and the rate times dt."""
 
-
 APART, SEEN = 0.01, 0.03
 """Distance that bodies keep, for errors of tracking, and from which they are looked at [m]."""
 
 BRAKING = np.array([[0.25], [0.5], [0.75], [1.0]])
 """Parts of the time of braking after which contacts are looked for."""
-
 
 TRIED = 0.05
 """Part of a joint's range that it would move alone, after all have braked before a contact."""
@@ -147,15 +145,20 @@ class Guard:
     limits : Limits
     acceleration : (n,)
         With which each joint brakes.
+
+    Attributes
+    ----------
+    needed : bool
+        Whether the model has geoms that can collide.
     """
 
     def __init__(self, body: Body, limits: Limits, acceleration: Array) -> None:
+        model, self._most = body.model, acceleration
+        self.needed = bool(model.npair or (model.geom_contype | model.geom_conaffinity).any())
         self._contacts = Contacts(body, APART, SEEN)
-        self._most, self.needed = acceleration, self._contacts.possible
-        if self.needed:
-            self._levers = self._contacts.levers(limits.position)
-            self._poses, self._room = np.zeros((len(BRAKING), body.n)), np.zeros(len(BRAKING))
-            self._step = np.diag(TRIED * np.ptp(limits.position, axis=1))
+        self._levers = self._contacts.levers(limits.position) if self.needed else np.zeros(body.n)
+        self._poses, self._room = np.zeros((len(BRAKING), body.n)), np.zeros(len(BRAKING))
+        self._step = np.diag(TRIED * np.ptp(limits.position, axis=1))
 
     def free(self, q: Array, v: Array, now: Array) -> bool:
         """Return whether bodies stay apart, or come no nearer than at the position ``now``, (n,).
