@@ -319,14 +319,14 @@ class Contacts:
         The largest over 200 random positions within limits, (n, 2).
         """
         model, random, (low, high) = self._model, np.random.default_rng(0), limits.T
-        reach, turns = np.zeros((model.ngeom, model.nv)), np.zeros((2, 3, model.nv))
+        reach, turns = np.zeros(model.nv), np.zeros((2, 3, model.nv))
         for q in low + (high - low) * random.random((200, len(limits))):
             self._pass(q)
             for geom, radius in enumerate(model.geom_rbound):
                 self._engine.mj_jacGeom(model, self._data, *turns, geom)
                 sizes = np.linalg.norm(turns, axis=1)
-                reach[geom] = np.maximum(reach[geom], sizes[0] + radius * sizes[1])
-        result: Array = reach.max(axis=0)[self._body.dofs]
+                reach = np.maximum(reach, sizes[0] + radius * sizes[1])
+        result: Array = reach[self._body.dofs]
         return result
 
 
