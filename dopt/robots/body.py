@@ -7,11 +7,14 @@ linear ones: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from dopt.errors import SpecificationError, given_path, install_command
 from dopt.systems.mujoco import log_warnings
@@ -97,7 +100,6 @@ class Body:
         self.moved = tuple(b for b in range(1, model.nbody) if self._paths[b])
         self.bodies = tuple(_name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in self.moved)
         self.notes = tuple(_left_out(model, self._ids))
-        self._data = mujoco.MjData(model)
 
     @classmethod
     def load(cls, file: str | Path) -> Body:
@@ -249,29 +251,83 @@ class Body:
         """
         import mujoco
 
-        data = self._data
-        kept = self._touching(self.home)
-        found = []
-        for row, q in enumerate(positions):
-            for one, other in sorted(self._touching(q) - kept):
-                names = (_name(self.model, mujoco.mjtObj.mjOBJ_BODY, b) for b in (one, other))
-                found.append((row, *names))
-        mujoco.mj_resetData(self.model, data)
-        return found  # type: ignore[return-value]  # names are two
+        return [
+            (row, *(_name(self.model, mujoco.mjtObj.mjOBJ_BODY, b) for b in pair))  # type: ignore[misc]  # names are two
+            for row, q in enumerate(positions)
+            for pair in sorted(self._contacts.near(q))
+        ]
 
-    def _touching(self, positions: Array) -> set[tuple[int, int]]:
+    @functools.cached_property
+    def _contacts(self) -> Contacts:
+        return Contacts(self)
+
+
+class Contacts:
+    """Pairs of bodies that come near each other, and do not touch at home.
+
+    Parameters
+    ----------
+    body : Body
+    apart : float
+        Distance that they are to keep [m]; half of the one at home, where that is less.
+    seen : float
+        Distance from which they are looked at [m]; 0 finds contacts alone.
+    """
+
+    def __init__(self, body: Body, apart: float = 0.0, seen: float = 0.0) -> None:
         import mujoco
 
+        self._body, self._engine, self._free = body, mujoco, seen - apart
+        self._model = model = copy.copy(body.model) if seen else body.model
+        if seen:
+            model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_OVERRIDE
+            model.opt.o_margin = seen
+        self._data = mujoco.MjData(model)
+        moved = list(body.moved)
+        self._kept = np.full((model.nbody, model.nbody), -np.inf)
+        self._kept[moved] = self._kept[:, moved] = apart
+        pairs, distances = self._pass(body.home)
+        at_home = np.where((distances > 0.0) & (seen > 0.0), 0.5 * distances, -np.inf)
+        for a, b in (pairs.T, pairs.T[::-1]):
+            np.minimum.at(self._kept, (a, b), at_home)
+
+    def _pass(self, positions: Array) -> tuple[npt.NDArray[np.int32], Array]:
+        """Return the bodies of each contact, (k, 2), and their distances, (k,) [m]."""
         data = self._data
-        data.qpos[:] = self.model.qpos0
-        data.qpos[self.addresses] = positions
-        mujoco.mj_kinematics(self.model, data)
-        mujoco.mj_comPos(self.model, data)
-        mujoco.mj_collision(self.model, data)
-        if not data.ncon:
-            return set()
-        pairs = np.sort(self.model.geom_bodyid[data.contact.geom], axis=1)
-        return {(a, b) for a, b in pairs.tolist() if a in self.moved or b in self.moved}
+        data.qpos[self._body.addresses] = positions
+        self._engine.mj_kinematics(self._model, data)
+        self._engine.mj_comPos(self._model, data)
+        self._engine.mj_collision(self._model, data)
+        contact = data.contact
+        return self._model.geom_bodyid[contact.geom], np.array(contact.dist)
+
+    def near(self, positions: Array) -> set[tuple[int, int]]:
+        """Return the pairs that the engine finds in contact at positions, (n,)."""
+        pairs, _ = self._pass(positions)
+        counted = np.isfinite(self._kept[pairs[:, 0], pairs[:, 1]])
+        return {(min(pair), max(pair)) for pair in pairs[counted].tolist()}
+
+    def room(self, positions: Array) -> float:
+        """Return how far the nearest pair is beyond the distance to keep [m], negative within."""
+        pairs, distances = self._pass(positions)
+        room = distances - self._kept[pairs[:, 0], pairs[:, 1]]
+        return float(room.min(initial=self._free))
+
+    def levers(self, limits: Array) -> Array:
+        """Return how far a unit of each joint moves any geom [m], (n,).
+
+        The largest over 200 random positions within limits, (n, 2).
+        """
+        model, random, (low, high) = self._model, np.random.default_rng(0), limits.T
+        reach, turns = np.zeros(model.nv), np.zeros((2, 3, model.nv))
+        for q in low + (high - low) * random.random((200, len(limits))):
+            self._pass(q)
+            for geom, radius in enumerate(model.geom_rbound):
+                self._engine.mj_jacGeom(model, self._data, *turns, geom)
+                sizes = np.linalg.norm(turns, axis=1)
+                reach = np.maximum(reach, sizes[0] + radius * sizes[1])
+        result: Array = reach[self._body.dofs]
+        return result
 
 
 _HINGE, _SLIDE = 3, 2

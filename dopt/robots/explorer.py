@@ -19,7 +19,7 @@ from dopt.errors import ExplorationError, SpecificationError, unknown_name
 from dopt.robots.body import Body, Motion
 from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
 from dopt.robots.limits import Limits
-from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.tracking import Guard, KnownBody, Tracker, possible_acceleration
 from dopt.robots.windows import window_size
 from dopt.sphere import sphere_maximizer
 from dopt.types import Array
@@ -51,6 +51,9 @@ LIFTED = 2.0
 LOST = 50
 """Measurements in turn that make no sense, after which the next is believed."""
 
+AWAY = 1.0
+"""Seconds for which references lead away from a contact that torques came near."""
+
 INPUTS = ("references", "torques")
 
 _log = logging.getLogger("dopt.robots")
@@ -72,6 +75,7 @@ class RobotExplorer:
     one that narrows the widest intervals of its friction curve most a second; ripple is a
     nuisance.
     With ``inputs="torques"``, the torques of each period are the paper's D-optimal step.
+    All joints brake before contacts of bodies that do not touch at home, and are then led away.
 
     Parameters
     ----------
@@ -135,6 +139,7 @@ class RobotExplorer:
         self.known = KnownBody(self.body)
         possible, inertia = possible_acceleration(self.known, limits)
         self.acceleration = USED * possible
+        self._guard = Guard(self.body, limits, self.acceleration)
         self.learner = FrictionLearner(
             limits,
             self.known.inverse,
@@ -149,11 +154,13 @@ class RobotExplorer:
         self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
         n = self.body.n
         self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
-        self.counts = {"bad": 0, "late": 0, "plans": 0, "windows": 0, "changed": 0}
+        self._wary, self._away = np.zeros(n, dtype=bool), 0.0  # since a contact was near
+        self.counts = {"bad": 0, "late": 0, "near": 0, "plans": 0, "windows": 0, "changed": 0}
         self.warnings: list[str] = []
         self.steps, self._wrong, self._asked = 0, 0, False
         self._rows: list[tuple[Array, ...]] = []
-        self._recent: deque[Array] = deque(maxlen=RECENT)
+        self._recent: deque[tuple[Any, ...]] = deque(maxlen=RECENT)
+        self._unsure: Array | None = None  # covariance of the payload's mass and first moment
         self._payload: list[tuple[Any, ...]] | None = None
         self._since = 0  # windows since the body was last known to change
         self._done = False
@@ -185,9 +192,10 @@ class RobotExplorer:
             self._begin(measured)
         self._check_time(time)
         trusted = self._observe(measured)
-        if self.inputs == "torques" and trusted and not self._done:
-            torque = self._torques()
-        else:
+        self._away -= self.dt
+        leads = self.inputs == "references" or self._away > 0.0 or not trusted or self._done
+        torque = None if leads else self._torques()
+        if torque is None:
             self._advance(trusted, began + self._deadline)
             torque = self._tracker.torque(self._q, self._v, self._a)
         self._asked, self._torque = True, torque
@@ -281,11 +289,23 @@ class RobotExplorer:
         v = self._v + a * self.dt
         rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
         blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
-        a = np.where(blocked, np.clip(-self._v / self.dt, -most, most), a)
-        self._a, self._v = a, self._v + a * self.dt
-        self._q = self._q + self.dt * self._v
+        brake = np.clip(-self._v / self.dt, -most, most)
+        a = np.where(blocked, brake, a)
+        v = self._v + a * self.dt
+        if not self._guard.free(self._q + self.dt * v, v, self._q):
+            a, v = brake, self._v + brake * self.dt
+            self._rest()
+        self._a, self._v, self._q = a, v, self._q + self.dt * v
         reached = np.abs(self._v - self._target) < 1e-9
-        self._hold = np.where(blocked, 0.0, self._hold - self.dt * reached)
+        ended = blocked & ~self._wary
+        self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
+
+    def _rest(self) -> None:
+        """Let all joints brake, and plan one after another when the last one is at rest."""
+        self.counts["near"] += 1
+        stop = np.abs(self._v) / self.acceleration
+        self._target[:], self._wary[:] = 0.0, True
+        self._hold = stop.max() - stop + self.dt * np.arange(1, len(stop) + 1)
 
     def _segment(self, j: int) -> tuple[float, float]:
         """Return the speed and the time for which joint j keeps it with the largest gain a second.
@@ -303,8 +323,11 @@ class RobotExplorer:
         room = (end - start - u * np.abs(u) / (2.0 * most)) / u
         hold = np.minimum(hold, room)
         fits = hold >= least
+        if self._wary[j]:
+            fits &= np.where(u < 0.0, *self._guard.open(self._q, j))
         if not fits.any():
-            return 0.0, 0.0
+            return 0.0, float(self._wary[j] * least)
+        self._wary[j] = False
         speeds, start, hold, rising = speeds[fits], start[fits], hold[fits], rising[fits]
         rows = learner.model.jacobian(
             np.broadcast_to(learner.mean[j : j + 1, :p], (1, p)), speeds[None]
@@ -327,8 +350,8 @@ class RobotExplorer:
 
     # Torques: the paper's step.
 
-    def _torques(self) -> Array:
-        """Return torques on the ball that maximise the linearised gain, or brake.
+    def _torques(self) -> Array | None:
+        """Return torques on the ball that maximise the linearised gain; None before a contact.
 
         The state moves q̇ first: with δ = dt M⁻¹ u the gain Σ_j (J_j + δ_j ∂J_j)ᵀ P_j (·) is
         quadratic, with Q = dt² M⁻ᵀ diag(∂JᵀP∂J) M⁻¹ and v = -dt M⁻ᵀ (JᵀP∂J).
@@ -358,8 +381,13 @@ class RobotExplorer:
             brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
             a = np.where(guarded, brake, a)
         self._a = a
-        demand = mass @ self._a + bias + friction
         self._q, self._v = tracker.q.copy(), tracker.v.copy()
+        after = tracker.v + self.dt * a
+        if not self._guard.free(tracker.q + self.dt * after, after, tracker.q):
+            self._rest()
+            self._away = AWAY
+            return None
+        demand = mass @ self._a + bias + friction
         torque: Array = np.minimum(np.maximum(demand, -limits.torque), limits.torque)
         return torque
 
@@ -377,7 +405,9 @@ class RobotExplorer:
                 self._lift(self._payload)
             return
         before = self.learner.feedforward(self._v)
-        self._recent.append(self.learner.learn(means, rates) / np.sqrt(self.learner.inflation))
+        standard = self.learner.learn(means, rates)
+        wide = np.sqrt(self.learner.inflation)
+        self._recent.append((standard / wide, self.learner.unit * wide, means))
         self._q = self._q - self._tracker.lag(self.learner.feedforward(self._v) - before)
         if self._changed():
             self.counts["changed"] += 1
@@ -399,10 +429,24 @@ class RobotExplorer:
         few = len(self._recent) < RECENT or self._since < 3 * RECENT
         if few or self.inputs == "torques":
             return False
-        recent = np.array(self._recent)
-        known = np.isfinite(recent)
-        sums = np.where(known, recent, 0.0).sum(axis=0) ** 2 / np.maximum(known.sum(axis=0), 1)
-        return bool(sums.sum() > self._alarm)
+        standard, unit = (np.array([row[i] for row in self._recent]) for i in range(2))
+        known = np.isfinite(standard)
+        size = np.sqrt(np.maximum(known.sum(axis=0), 1))
+        sums = np.where(known, standard, 0.0).sum(axis=0) / size
+        if self._unsure is None or sums @ sums <= self._alarm:
+            return bool(sums @ sums > self._alarm)
+        # What a payload that was weighed may weigh more or less is no change.
+        rows = self._carried([row[2] for row in self._recent]) * (known / unit)[..., None]
+        rows = rows.sum(axis=0) / size[:, None]
+        spread = np.eye(len(sums)) + rows @ self._unsure @ rows.T
+        return bool(sums @ np.linalg.solve(spread, sums) > self._alarm)
+
+    def _carried(self, windows: list[tuple[Array, ...]]) -> Array:
+        """Return torques by mass and first moment on the last body, (k, n, 4), parts of limits."""
+        q, v, a = (np.array([means[i] for means in windows]) for i in range(3))
+        rows = self.body.regressor(Motion(self.learner.window.seconds, q, v, a))[:, :, -10:-6]
+        result: Array = rows / self.limits.torque[:, None]
+        return result
 
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
@@ -410,15 +454,14 @@ class RobotExplorer:
         Columns of the regressor, less friction and ripple as they are known, weighed by the noise.
         """
         learner = self.learner
-        q, v, a = (np.array([means[i] for means, _ in windows]) for i in range(3))
-        own = self.body.regressor(Motion(learner.window.seconds, q, v, a))[:, :, -10:-6]
         missing = np.array([learner.innovations(*window)[0] for window in windows])
         moving = np.isfinite(missing)
         weights = moving / learner.noise
-        design = own / self.limits.torque[:, None] * weights[..., None]
-        found, *_ = np.linalg.lstsq(
-            design.reshape(-1, 4), (np.nan_to_num(missing) * weights).reshape(-1), rcond=1e-6
-        )
+        rows = self._carried([means for means, _ in windows]) * weights[..., None]
+        design, wanted = rows.reshape(-1, 4), (np.nan_to_num(missing) * weights).ravel()
+        found, *_ = np.linalg.lstsq(design, wanted, rcond=1e-6)
+        misfit = ((wanted - design @ found) ** 2).sum() / max(moving.sum() - 4, 1)
+        self._unsure = misfit * np.linalg.inv(design.T @ design + 1e-6 * np.eye(4))
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)

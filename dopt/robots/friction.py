@@ -163,7 +163,14 @@ class FrictionLearner:
         Probability that an interval misses, 0.05.
     window : int
         Periods of control in a window.
+
+    Attributes
+    ----------
+    unit : (n,)
+        Deviation that was expected of the last window's innovations, as a part of the limit.
     """
+
+    unit: Array
 
     def __init__(
         self,
@@ -273,6 +280,7 @@ class FrictionLearner:
         moving = np.isfinite(missing)
         error = np.where(moving, missing, 0.0)
         standard = error / np.sqrt(1.0 + variance)
+        self.unit = self.noise * np.sqrt(1.0 + variance)
         result = np.where(moving, standard / self.noise, np.nan)
         spread = self._spread(rows)
         self.mean += spread * (error / (1.0 + variance))[:, None]

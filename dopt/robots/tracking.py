@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dopt.robots.body import Body
+from dopt.robots.body import Body, Contacts
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -16,6 +16,15 @@ BANDWIDTH = 40.0
 
 CORRECTION = 0.5, 0.1
 """Parts of an innovation that correct the observed position, and the rate times dt."""
+
+APART, SEEN = 0.01, 0.03
+"""Distance that bodies keep, for errors of tracking, and from which they are looked at [m]."""
+
+BRAKING = np.array([[0.25], [0.5], [0.75], [1.0]])
+"""Parts of the time of braking after which contacts are looked for."""
+
+TRIED = 0.05
+"""Part of a joint's range that it would move alone, after all have braked before a contact."""
 
 
 class KnownBody:
@@ -125,6 +134,57 @@ class Tracker:
         return fed / BANDWIDTH**2
 
 
+class Guard:
+    """Check that a robot can brake to rest without contacts that are not there at home.
+
+    A pose is looked at again when the joints may have moved a geom by the room that there was.
+
+    Parameters
+    ----------
+    body : Body
+    limits : Limits
+    acceleration : (n,)
+        With which each joint brakes.
+
+    Attributes
+    ----------
+    needed : bool
+        Whether the model has geoms that can collide.
+    """
+
+    def __init__(self, body: Body, limits: Limits, acceleration: Array) -> None:
+        model, self._most = body.model, acceleration
+        self.needed = bool(model.npair or (model.geom_contype | model.geom_conaffinity).any())
+        self._contacts = Contacts(body, APART, SEEN)
+        self._levers = self._contacts.levers(limits.position) if self.needed else np.zeros(body.n)
+        self._poses, self._room = np.zeros((len(BRAKING), body.n)), np.zeros(len(BRAKING))
+        self._step = np.diag(TRIED * np.ptp(limits.position, axis=1))
+
+    def free(self, q: Array, v: Array, now: Array) -> bool:
+        """Return whether bodies stay apart, or come no nearer than at the position ``now``, (n,).
+
+        All joints brake from position q and velocity v, (n,).
+        """
+        if not self.needed:
+            return True
+        stop = np.abs(v) / self._most
+        t = np.minimum(BRAKING * stop.max(), stop)
+        poses = q + t * (v - 0.5 * np.sign(v) * self._most * t)
+        moved = np.abs(poses - self._poses) @ self._levers
+        for k in np.flatnonzero(moved >= self._room):
+            room = self._contacts.room(poses[k])
+            if room < 0.0 and room < self._contacts.room(now):
+                return False
+            self._poses[k], self._room[k] = poses[k], room
+        return True
+
+    def open(self, q: Array, j: int) -> tuple[bool, bool]:
+        """Return whether joint j may move down, and up, from a position, (n,)."""
+        least = min(0.0, self._contacts.room(q))
+        below, above = (self._contacts.room(q + way * self._step[j]) for way in (-1.0, 1.0))
+        return below >= least, above >= least
+
+
 def possible_acceleration(
     known: KnownBody, limits: Limits, share: float = 0.7
 ) -> tuple[Array, Array]:
@@ -143,4 +203,4 @@ def possible_acceleration(
     return least, largest
 
 
-__all__ = ["BANDWIDTH", "KnownBody", "Tracker", "possible_acceleration"]
+__all__ = ["BANDWIDTH", "Guard", "KnownBody", "Tracker", "possible_acceleration"]

@@ -52,19 +52,24 @@ def _seeds(values: pd.DataFrame, arm: str) -> int:
 
 
 def robots_coverage() -> str:
-    """Shares of 95 % intervals that held when the explorer stopped, their width, and the time."""
+    """Intervals that held when the explorer stopped, their width, the time, shares of limits."""
     names = {
         "held: curve": "curve held",
         "held: Coulomb": "Coulomb held",
         "held: viscous": "viscous held",
         "width beside a fixed time's: curve": "width by a fixed time's, median",
         "seconds": "seconds to the stop, median",
+        "share of limit: position": "share of the limits of position, largest",
+        "share of limit: velocity": "of velocity",
+        "share of limit: torque": "of torque",
     }
     body = []
     for quantity, title in names.items():
         values = _values("coverage", quantity).groupby("arm").value
         if quantity.startswith("held"):
             cells = [f"{100.0 * values.mean()[arm]:.1f} %" for arm in ARMS]
+        elif quantity.startswith("share"):
+            cells = [f"{100.0 * values.max()[arm]:.1f} %" for arm in ARMS]
         else:
             cells = [number(values.median()[arm]) for arm in ARMS]
         body.append([title, *cells])

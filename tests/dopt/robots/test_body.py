@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body, Motion
+from dopt.robots.body import Body, Contacts, Motion
 from dopt.robots.limits import Limits
 from dopt.robots.parameters import Identifiability, Unknowns, relative_errors
 
@@ -279,6 +279,26 @@ def test_collisions_are_found_and_contacts_at_home_are_not(tmp_path: Path) -> No
     body = Body.load(source)
     touching = body.collisions(np.array([[0.0], [1.4], [-1.4]]))
     assert touching == [(1, "world", "arm")]  # the axis turns it down
+
+
+def test_room_is_the_distance_beyond_the_one_to_keep(tmp_path: Path) -> None:
+    source = tmp_path / "near.xml"
+    source.write_text(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+        <body pos="0 0 0.05"><joint axis="0 1 0" range="-2 2"/>
+        <geom type="sphere" pos="0.5 0 0" size="0.02"/>
+        <body pos="0.5 0 0.2"><joint type="slide" axis="0 0 1" range="-0.3 0.3"/>
+        <geom type="sphere" size="0.03"/></body></body></worldbody></mujoco>"""
+    )
+    body = Body.load(source)
+    contacts = Contacts(body, 0.02, 0.05)
+    # At home the ball is 0.03 above the floor, and keeps half of that.
+    assert contacts.room(np.zeros(2)) == pytest.approx(0.015)
+    assert contacts.room(np.array([0.04, 0.0])) == pytest.approx(0.015 - 0.5 * np.sin(0.04))
+    assert contacts.room(np.array([0.2, 0.0])) < 0.0
+    assert contacts.room(np.array([-1.0, 0.0])) == pytest.approx(0.03)  # nothing within 0.05
+    levers = contacts.levers(np.array([[-2.0, 2.0], [-0.3, 0.3]]))
+    assert levers == pytest.approx([np.hypot(0.5, 0.5) + 0.03, 1.0], abs=0.02)
 
 
 def test_without_mujoco_one_sentence_says_what_to_install(arm: Body) -> None:

@@ -1,15 +1,18 @@
 """Explorer of robots with a known body: limits, stops, payloads, and bad measurements."""
 
+import itertools
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.robots.body import Body
-from dopt.robots.explorer import RobotExplorer
+from dopt.robots.explorer import LOST, RobotExplorer
 from dopt.robots.friction import SPEEDS
 from dopt.robots.limits import Limits
-from dopt.robots.tracking import KnownBody
+from dopt.robots.tracking import Guard, KnownBody
 from studies.robots.online import LOOK, explore, true_values
 from studies.robots.simulated import SimulatedRobot, jaco
 
@@ -42,6 +45,30 @@ def small() -> tuple[Body, Limits]:
     )
 
 
+WALLS = """<worldbody>
+    <geom type="plane" pos="0 0 -0.05" size="1 1 1"/>
+    <geom type="plane" pos="0 0.25 0" zaxis="0 -1 0" size="1 1 1"/>
+"""
+
+
+def walled() -> tuple[Body, Limits]:
+    """Return the arm beside a wall and above a floor, both within its joints' limits."""
+    text = ARM.replace("<worldbody>", WALLS)
+    return Body(mujoco.MjModel.from_xml_string(text)), small()[1]
+
+
+def positions_of(robot: SimulatedRobot, explorer: RobotExplorer, seconds: float) -> np.ndarray:
+    """Return the true positions of a run, (T, n)."""
+    found, q = [], robot.state()[0]
+    for _ in range(round(seconds / explorer.dt)):
+        torque = explorer.ask(q)
+        robot.step(torque)
+        q = robot.state()[0]
+        explorer.tell(q, torque)
+        found.append(robot.q)
+    return np.array(found)
+
+
 @pytest.mark.parametrize("arm", [small, jaco])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_limits_are_kept_and_friction_is_learned(arm, seed: int) -> None:
@@ -69,6 +96,52 @@ def test_references_keep_their_limits_exactly() -> None:
         robot.step(torque)
         q = robot.state()[0]
         explorer.tell(q, torque)
+
+
+@pytest.mark.parametrize(("inputs", "seeds"), [("references", 20), ("torques", 4)])
+def test_bodies_do_not_touch_what_they_do_not_touch_at_home(inputs: str, seeds: int) -> None:
+    body, limits = walled()
+    near = 0
+    for seed in range(seeds):
+        explorer = RobotExplorer(body, limits, inputs=inputs, seed=seed)
+        went = positions_of(SimulatedRobot(body, limits, seed), explorer, 2.0)
+        assert not body.collisions(went)
+        assert np.ptp(went[-500:], axis=0).max() > 0.1  # it does not stay before the wall
+        near += explorer.counts["near"]
+    assert near >= seeds / 2
+    blind = RobotExplorer(small()[0], limits, inputs=inputs, seed=0)
+    assert blind.counts["near"] == 0
+    assert body.collisions(positions_of(SimulatedRobot(body, limits, 0), blind, 4.0))
+
+
+def test_geoms_that_cannot_collide_are_not_looked_at() -> None:
+    text = ARM.replace("<geom", '<geom contype="0" conaffinity="0"')
+    limits = small()[1]
+    assert Guard(small()[0], limits, limits.acceleration).needed
+    guard = Guard(Body(mujoco.MjModel.from_xml_string(text)), limits, limits.acceleration)
+    assert not guard.needed
+    assert guard.free(np.zeros(3), limits.velocity, np.zeros(3))
+
+
+def test_friction_is_learned_beside_a_wall() -> None:
+    body, limits = walled()
+    robot = SimulatedRobot(body, limits, 2)
+    explorer = RobotExplorer(body, limits, seed=2)
+    trace = explore(robot, explorer, 5.0)
+    assert explorer.counts["near"] > 0
+    assert trace.errors[-1].max() < 0.1
+    assert trace.shares["position"] < 1.0
+    assert trace.shares["velocity"] < 1.03
+
+
+def test_a_robot_that_begins_too_near_a_wall_leaves_it() -> None:
+    body, limits = walled()
+    robot = SimulatedRobot(body, limits, 0)
+    turned = np.array([np.arcsin((0.25 - 0.034) / 0.55), 0.0, 0.0])  # 4 mm from the wall
+    robot.place(turned)
+    went = positions_of(robot, RobotExplorer(body, limits), 2.0)
+    assert not body.collisions(went)
+    assert went[:, 0].min() < turned[0] - 0.1
 
 
 def test_it_stops_when_every_interval_is_as_narrow_as_asked_for() -> None:
@@ -190,6 +263,48 @@ def test_a_plan_that_is_late_leaves_the_joint_braking() -> None:
     assert explorer.counts["late"] == 3
     assert explorer.counts["plans"] == 0
     np.testing.assert_array_equal(explorer._v, 0.0)
+
+
+def test_a_clock_that_is_slow_leaves_joints_braking_within_their_limits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ticks, slow = itertools.count(), 0.0
+    now = SimpleNamespace(perf_counter=lambda: slow * next(ticks))
+    monkeypatch.setattr("dopt.robots.explorer.clock", now)
+    body, limits = small()
+    robot = SimulatedRobot(body, limits, 6)
+    explorer = RobotExplorer(body, limits, deadline=5e-4, seed=6)
+    explore(robot, explorer, 1.0)
+    assert explorer.counts["late"] == 0
+    plans, slow = explorer.counts["plans"], 1e-3  # of a second, a call
+    trace = explore(robot, explorer, 3.0)
+    assert explorer.counts["plans"] == plans
+    assert explorer.counts["late"] > 100
+    np.testing.assert_array_equal(explorer._v, 0.0)
+    assert np.abs(robot.v / limits.velocity).max() < 0.02
+    slow = 0.0
+    again = explore(robot, explorer, 1.0)
+    assert explorer.counts["plans"] > plans
+    for shares in (trace.shares, again.shares):
+        assert shares["position"] < 1.0
+        assert shares["velocity"] < 1.03
+        assert shares["torque"] <= 1.0
+
+
+def test_an_encoder_that_stays_displaced_is_believed_after_a_while() -> None:
+    body, limits = small()
+    robot = SimulatedRobot(body, limits, 7)
+    explorer = RobotExplorer(body, limits, seed=7)
+    explore(robot, explorer, 1.0)
+    bad, windows, moved = [], explorer.counts["windows"], np.array([0.0, 0.3, 0.0])
+    for _ in range(500):
+        torque = explorer.ask(robot.state()[0] + moved)
+        robot.step(torque)
+        explorer.tell(robot.state()[0] + moved, torque)
+        bad.append(explorer.counts["bad"])
+    assert bad[LOST] == bad[-1] == LOST + 1
+    assert np.abs(explorer._v).sum() > 0.0
+    assert explorer.counts["windows"] > windows
 
 
 def test_a_gap_in_time_ends_the_window() -> None:
