@@ -45,6 +45,12 @@ ABOVE = 1.1
 FLOOR = 3.0
 """Weight of the logarithm by which the worst error exceeds its reference."""
 
+LEAST = 0.1
+"""Share of its scale that an unknown parameter is at the least, where torques are linearised.
+
+Where a centre or a friction is 0, its error does not depend on that of the mass or gear times it.
+"""
+
 FRICTION = "damping,frictionloss"
 """Unknown parameters beside the requested ones unless told otherwise."""
 
@@ -130,6 +136,8 @@ class Problem:
         asked = Unknowns(body, limits, wanted, noise)
         beside = [one for one in nuisance.split(",") if one]
         self.unknowns = Unknowns(body, limits, [*asked.names, *beside], noise)
+        values, least = self.unknowns.values, LEAST * self.unknowns.scales
+        self.tangent, _ = self.unknowns.at(np.copysign(np.maximum(abs(values), least), values))
         self.count = len(asked)
         self._friction = _friction(body, limits)
         self.reference = np.ones(self.count)
@@ -140,7 +148,7 @@ class Problem:
         return self.unknowns.parameters[: self.count]
 
     def information(self, motion: Motion) -> Array:
-        return self.unknowns.information(motion, self.rate)
+        return self.tangent.information(motion, self.rate)
 
     def determinant(self, information: Array) -> float:
         """Return log det of the information about the requested parameters, with the prior."""
@@ -180,7 +188,7 @@ class Problem:
         touching = {row for row, _, _ in self.body.collisions(looked)}
         broken = max(strain - ROOM, 0.0)
         broken += 0.5 + len(touching) / len(looked) if touching else 0.0
-        information = self.unknowns.information(motion, self.rate, rigid)
+        information = self.tangent.information(motion, self.rate, rigid)
         found = self.determinant(information), self.errors(information), broken
         return Candidate(family.name, family, numbers, reach, *found, self.score(*found))
 
@@ -252,7 +260,7 @@ class Design:
         seed : int
             Seed of the draws.
         effort : int
-            Motions that are tried for each searched family.
+            Motions that are tried for the best searched family; for the others a quarter.
         progress : callable, optional
             Is given a line for each family.
         """
@@ -261,7 +269,7 @@ class Design:
         rng = np.random.default_rng(seed)
         found = list(_candidates(problem, rng, effort, progress))
         bound, gap = attainable(problem, rng)
-        null = count_null(problem.unknowns, found[0].motion(COARSE))
+        null = count_null(problem.tangent, found[0].motion(COARSE))
         identified = max(problem.count - null, 1)
         shared = [
             dataclasses.replace(one, share=math.exp((one.determinant - bound) / identified))
@@ -291,11 +299,15 @@ def _candidates(
         for family in (Fourier(limits, seconds, period) for period in [*periods, seconds])
     ]
     tried.sort(key=lambda group: min(one.score for one in group))
-    for group in tried[:2]:
-        yield searched(problem, group[0].family, rng, effort, group, progress)
     ladder = Ladder(limits, seconds)
-    yield searched(problem, ladder, rng, effort, [], progress)
-    yield receding(problem, ladder, rng, progress)
+    planned = receding(problem, ladder, rng, progress)
+    found = [
+        searched(problem, group[0].family, rng, effort // 4, group, progress)
+        for group in (*tried[:2], [dataclasses.replace(planned, name=ladder.name)])
+    ]
+    found.sort(key=lambda one: one.score)
+    yield searched(problem, found[0].family, rng, effort, found[:1], progress)
+    yield from (*found[1:], planned)
 
 
 def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
@@ -377,7 +389,7 @@ def attainable(problem: Problem, rng: np.random.Generator) -> tuple[float, float
         The bound holds the gap.
     """
     states = _states(problem, rng)
-    rows = problem.unknowns.weighted(states, problem.rate * problem.seconds / states.dt)
+    rows = problem.tangent.weighted(states, problem.rate * problem.seconds / states.dt)
     p, s = len(problem.unknowns), problem.count
     weights = np.full(len(rows), 1.0 / len(rows))
     flat = rows.reshape(-1, p)

@@ -6,6 +6,7 @@ information of a motion about the parameters p is the sum of (∂τ/∂p)ᵀ Σ�
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import fnmatch
 from collections.abc import Sequence
@@ -142,6 +143,36 @@ class Unknowns:
     @property
     def values(self) -> Array:
         return np.array([one.value for one in self.parameters])
+
+    def at(self, values: Array) -> tuple[Unknowns, Array]:
+        """Return these parameters at other values, (p,), of the same scales, and the gears, (n,).
+
+        :meth:`regressor` is then of the torque that a gear makes, ``gears`` times the command.
+        """
+        import mujoco
+
+        body, model = self.body, copy.copy(self.body.model)
+        gears = np.ones(body.n)
+        # Short cuts of the engine for centres at 0 and constant inertias.
+        model.body_sameframe[:] = model.body_simple[:] = model.dof_simplenum[:] = 0
+        for one, value in zip(self.parameters, values, strict=True):
+            if one.kind in OF_JOINTS:
+                k = body.joints.index(one.place)
+                if one.kind == "gear":
+                    gears[k] = value
+                else:
+                    getattr(model, f"dof_{one.kind}")[body.dofs[k]] = value
+                continue
+            b, axis = body.moved[body.bodies.index(one.place)], "xyz".find(one.kind[-1])
+            if one.kind == "mass":
+                model.body_mass[b] = value
+            else:
+                part = model.body_ipos if one.kind.startswith("com") else model.body_inertia
+                part[b, axis] = value
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        result = copy.copy(self)
+        result.body = Body(model, body.source)
+        return result, gears
 
     def _matching(self, name: str) -> list[Parameter]:
         """Return the parameters that a name such as ``mass:link7`` stands for."""

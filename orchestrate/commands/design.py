@@ -70,7 +70,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--effort",
         type=positive("--effort", int),
         default=600,
-        help="motions that the search of a family tries (600)",
+        help="motions that are tried for the best family; a quarter for the others (600)",
     )
     parser.add_argument(
         "--out",

@@ -10,7 +10,7 @@ pytest.importorskip("dm_control", reason="needs dm_control")
 
 from dopt.robots.design import Problem
 from dopt.robots.trajectories import Fourier
-from studies.robots.designs import CONTROL, UNKNOWN, changed, fitted, measured
+from studies.robots.designs import CONTROL, UNKNOWN, fitted, measured
 from studies.robots.simulated import Friction, SimulatedRobot, jaco
 from studies.robots.tables import TABLES
 
@@ -31,7 +31,8 @@ def test_a_fit_finds_the_parameters_of_a_robot_without_noise() -> None:
     one = problem.candidate(family, rng.standard_normal(family.size))
     off = np.abs(0.05 * rng.standard_normal(problem.count))
     values = problem.unknowns.values + off * problem.unknowns.scales
-    true, gears = changed(body, problem.requested, values)
+    unknowns, gears = problem.unknowns.at(values)
+    true = unknowns.body
     dry, damping = true.model.dof_frictionloss[true.dofs], true.model.dof_damping[true.dofs]
     flat = np.ones(body.n)
     friction = Friction(dry, damping, 0.0 * flat, flat, 0.01 * limits.velocity)

@@ -137,6 +137,22 @@ def test_regressors_are_derivatives_of_the_torques_of_the_engine(
         np.testing.assert_allclose(rows[:, :, i], expected, atol=1e-5 * max(1.0, np.ptp(expected)))
 
 
+def test_regressors_at_other_values_are_derivatives_there(arm: Body, limits: Limits) -> None:
+    """Differences between torques of bodies at values around those, in units of the old scales."""
+    unknowns = Unknowns(arm, limits, "mass,com,inertia,armature,gear:lift")
+    values = unknowns.values + 0.2 * unknowns.scales
+    there, gears = unknowns.at(values)
+    assert list(gears) == [1.0, 1.0, 1.2, 1.0]
+    np.testing.assert_array_equal(there.scales, unknowns.scales)
+    motion = random_motion(arm.n, 10)
+    rows = there.regressor(motion)
+    for i in range(len(unknowns) - 1):
+        step = 1e-5 * unknowns.scales[i] * np.eye(len(unknowns))[i]
+        more, less = (unknowns.at(values + way)[0].body.torques(motion) for way in (step, -step))
+        expected = (more - less) / 2e-5
+        np.testing.assert_allclose(rows[:, :, i], expected, atol=1e-5 * max(1.0, np.ptp(expected)))
+
+
 def test_dry_friction_and_gear(arm: Body, limits: Limits) -> None:
     motion = random_motion(arm.n)
     unknowns = Unknowns(arm, limits, "frictionloss:roll,gear:lift")

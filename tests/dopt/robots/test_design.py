@@ -10,8 +10,9 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
-from dopt.robots.design import Design, Problem, attainable, multisine
+from dopt.robots.design import LEAST, Design, Problem, attainable, multisine
 from dopt.robots.limits import Limits
+from dopt.robots.parameters import relative_errors
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
 from tests.dopt.robots.test_body import arm, jaco, limits
 
@@ -160,6 +161,35 @@ def test_expected_errors_are_reached_by_a_fit_to_simulated_torques() -> None:
     ratio = found.std(axis=1) / problem.errors(problem.information(motion))
     assert ratio.min() > 0.8
     assert ratio.max() < 1.2
+
+
+def test_a_centre_on_the_axis_in_the_file_has_the_error_of_the_mass(tmp_path: Path) -> None:
+    """Gravity tells mass times centre alone; where the file's centre is 0, the mass has no effect.
+
+    A robot whose centre is off by a tenth of its size has a tenth of the mass's error in it.
+    """
+    (tmp_path / "wheel.xml").write_text(
+        """<mujoco><worldbody><body name="wheel"><joint name="axle" axis="0 1 0" range="-1 1"/>
+        <inertial pos="0 0 0" mass="2" diaginertia="2e-4 2e-4 2e-4"/></body></worldbody></mujoco>"""
+    )
+    body = Body.load(tmp_path / "wheel.xml")
+    given = "joints: {axle: {velocity: 2, acceleration: 9, torque: 10}}"
+    (tmp_path / "limits.yaml").write_text(given)
+    limits = Limits.of(body, tmp_path / "limits.yaml")
+    problem = Problem(body, limits, "com_x,mass", 5.0, nuisance="", noise=0.001)
+    family = Fourier(limits, 5.0, 5.0)
+    motion = family.motion(np.random.default_rng(0).standard_normal(family.size), 0.01)
+    assert relative_errors(problem.unknowns.information(motion, 500.0))[0] < 0.01
+    error, _ = problem.errors(problem.information(motion))
+    assert error == pytest.approx(LEAST / np.sqrt(1.0 + LEAST**2), rel=0.02)
+
+
+def test_the_best_searched_family_has_the_whole_effort(arm: Body, limits: Limits) -> None:
+    lines: list[str] = []
+    design = Design.of(Problem(arm, limits, "damping", 3.0), effort=120, progress=lines.append)
+    searches = [line.split(" motions")[0] for line in lines if "motions" in line]
+    assert sorted(line.split(", ")[-1] for line in searches) == ["120", "30", "30", "30"]
+    assert searches[-1] == f"{design.best.name}, 120"
 
 
 @pytest.mark.parametrize("name", ["seconds", "noise", "rate"])
