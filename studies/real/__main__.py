@@ -65,6 +65,7 @@ CASES = {
         reference=plants.published(plants.QUBE, plants.QUANSER),
         horizons=(0.1, 0.2),
         options={"width": 0},
+        controller=plants.BALANCER,
     ),
 }
 """What is fitted, by the name in ``--only``."""

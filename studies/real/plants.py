@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
 
 from dopt.systems.plant import Plant, encoder, unknown
+from dopt.types import Array
 
 G = 9.81
 """[m/s²]"""
@@ -189,6 +193,27 @@ def _quanser() -> dict[str, float]:
 
 QUANSER = _quanser()
 """R 8.4 Ω, k .042, arm .095 kg and .085 m, pendulum .024 kg and .129 m, friction .0015, .0005."""
+
+
+class Controller(NamedTuple):
+    """Feedback of angles and of their rates, which a filter of the first order takes."""
+
+    proportional: tuple[float, ...]  # V/rad
+    derivative: tuple[float, ...]  # V s/rad
+    bandwidth: float  # 1/s
+    limit: float  # V
+
+    def step(self, memory: Array, angles: Array, dt: float) -> tuple[Array, float]:
+        """Return the memory, (2, n), and the voltage, after angles, (n,), of the next sample."""
+        last, rates = memory
+        rates = (rates + self.bandwidth * (angles - last)) / (1.0 + self.bandwidth * dt)
+        asked = np.dot(self.proportional, angles) + np.dot(self.derivative, rates)
+        return np.array([angles, rates]), float(asked)
+
+
+BALANCER = Controller((6.0, 30.0), (1.8, 2.5), 50.0, 10.0)
+"""What balanced the QUBE-Servo (``controller.toml`` of the source); it explains the recorded inputs
+to 1e-8 V where there is no test signal."""
 
 QUBE = Plant(
     states={"arm": "rad", "pendulum": "rad", "arm_rate": "rad/s", "pendulum_rate": "rad/s"},

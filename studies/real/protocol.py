@@ -7,6 +7,7 @@ windows, from initial states that are fitted in the same way.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -22,7 +23,9 @@ from dopt.fitting.model import Model, data_of
 from dopt.fitting.problem import Simulator, predicted
 from dopt.fitting.simulation import Data
 from dopt.log import Log
+from dopt.systems.base import next_state
 from dopt.systems.plant import Plant
+from studies.real.plants import Controller
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -32,6 +35,9 @@ SKIPPED = 0.05
 
 AROUND = 0.5
 """An angle moves by what it does so long before and after a row [s]."""
+
+LOOP = 10.0
+"""Time for which a closed loop is simulated [s]."""
 
 STRETCH = 2.0
 """Windows that begin within so many seconds are drawn together [s]."""
@@ -59,6 +65,8 @@ class Case:
         Smallest range of an angle after the history, in windows and in training data [rad].
     options : mapping of str to object
         Of :func:`dopt.fit`.
+    controller : Controller, optional
+        What balanced the plant, of whose angles the closed loop is simulated as well.
     """
 
     plant: Plant
@@ -69,6 +77,7 @@ class Case:
     every: float = 0.1
     moved: float = 0.0
     options: Mapping[str, Any] = field(default_factory=dict)
+    controller: Controller | None = None
 
 
 class Fold(NamedTuple):
@@ -83,6 +92,8 @@ class Fold(NamedTuple):
         Number of the stretch in which a window begins.
     found : str
         What was fitted.
+    closed : (2, n) or None
+        Errors of the closed loop, ours and of the reference, root mean square [rad].
     """
 
     run: str
@@ -90,6 +101,7 @@ class Fold(NamedTuple):
     theirs: Array
     stretches: Integers
     found: str
+    closed: Array | None = None
 
 
 def folds(
@@ -111,6 +123,9 @@ def folds(
         others = [log for other, log in given.items() if other != name]
         found = judged(case, name, others, tests[name], inner)
         say(f"{name}: {found.found}")
+        if found.closed is not None:
+            ours, theirs = (np.array2string(one, precision=3) for one in found.closed)
+            say(f"{name}: closed loop over {LOOP:g} s, RMSE {ours} rad, reference {theirs} rad")
         return found
 
     inner = max(1, workers // len(tests))
@@ -130,7 +145,42 @@ def judged(case: Case, name: str, given: Sequence[Log], left_out: Log, workers: 
     else:
         published = Model(case.reference)
         theirs = _errors(case, Simulator(published, data), published.prior, rows)
-    return Fold(name, ours, theirs, _stretches(case, data, rows), _described(fitted))
+    closed = None
+    if case.controller is not None and case.reference is not None:
+        values = {
+            name: value
+            for name, (value, _) in fitted.constants.items()
+            if name in case.plant.constants
+        }
+        mine = dataclasses.replace(case.plant, constants=values)
+        pair = (closed_loop(one, case.controller, data) for one in (mine, case.reference))
+        closed = np.array([*pair])
+    return Fold(name, ours, theirs, _stretches(case, data, rows), _described(fitted), closed)
+
+
+def closed_loop(plant: Plant, controller: Controller, data: Data) -> Array:
+    """Return the errors of the angles, (n,), root mean square, of the plant under its controller.
+
+    The simulation begins at the first recorded angles, at rest. The test signal is what the
+    recorded inputs have beyond what the controller asked for at the recorded angles.
+    """
+    rows = int(LOOP / plant.dt)
+    system, angles = plant.system(rows), data.measured[:rows]
+    n, parameters = angles.shape[1], system.parameters
+    recorded, own, errors = np.zeros((2, n)), np.zeros((2, n)), np.empty_like(angles)
+    x, signal = np.concatenate([angles[0], np.zeros(system.n_states - n)]), 0.0
+    for t, measured in enumerate(angles):
+        errors[t] = x[:n] - measured
+        recorded, asked = controller.step(recorded, measured, plant.dt)
+        applied = float(data.inputs[t, 0])
+        if abs(applied) < controller.limit:
+            signal = applied - asked
+        own, asked = controller.step(own, x[:n], plant.dt)
+        u = np.clip([asked + signal], -controller.limit, controller.limit)
+        rate = lambda z, u=u: np.array(system.known(tuple(z), tuple(u), parameters))  # noqa: E731  # of this input
+        x = next_state("rk4", rate, x, plant.dt)
+    found: Array = np.sqrt(np.mean(errors**2, axis=0))
+    return found
 
 
 def _described(fitted: Fitted) -> str:

@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.integrate import solve_ivp
 
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model
+from dopt.fitting.simulation import Data
 from studies.real import data, plants, results
 from studies.real.__main__ import CASES, QUESTIONS, main, parts
-from studies.real.protocol import Fold, folds
+from studies.real.protocol import Fold, closed_loop, folds
 
 DATA = os.environ.get("DOPT_DATA")
 recorded = pytest.mark.skipif(DATA is None, reason="DOPT_DATA names no folder of recorded runs")
@@ -169,6 +171,31 @@ def test_the_rotary_pendulum_keeps_its_energy_without_friction() -> None:
     flow, h = derivative(plant, x, np.zeros((20, 1))), 1e-5
     change = (energy(x + h * flow) - energy(x - h * flow)) / (2 * h)
     assert np.abs(change).max() < 1e-6 * np.abs(flow).max() ** 2
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_a_closed_loop_of_the_plant_itself_has_no_errors(right: bool) -> None:
+    """Against an independent integrator, with a test signal."""
+    case = CASES["qube"]
+    assert case.reference is not None
+    plant = dataclasses.replace(case.reference, constants=case.reference.constants | {"c1": 2.0})
+    system, gains = plant.system(1), plants.BALANCER
+    x, rates, last = np.array([0.02, 0.005, 0.0, 0.0]), np.zeros(2), np.zeros(2)
+    angles, inputs = [], []
+    for t in range(5000):
+        rates, last = (rates + 50.0 * (x[:2] - last)) / 1.1, x[:2]
+        asked = gains.proportional @ x[:2] + gains.derivative @ rates
+        u = np.clip([asked + 0.1 * np.sin(0.01 * t)], -10.0, 10.0)
+        angles.append(x[:2])
+        inputs.append(u)
+        flow = partial(lambda _, z, u: system.known(tuple(z), tuple(u), system.parameters), u=u)
+        x = solve_ivp(flow, (0.0, 0.002), x, rtol=1e-10, atol=1e-12).y[:, -1]
+    rows = np.zeros(len(angles), np.int64)
+    time = 0.002 * np.arange(len(angles))
+    data = Data(time, np.array(angles), np.array(inputs), rows, rows, np.ones(2))
+    errors = closed_loop(plant if right else case.reference, gains, data)
+    assert np.abs(inputs).max() < 10.0  # beyond it the test signal is not known
+    assert ((errors < 1e-4) == right).all()
 
 
 def test_a_ratio_has_the_interval_of_its_runs() -> None:
