@@ -23,8 +23,7 @@ from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
-from analysis.stats.curves import Axis, PlotOptions, Spread
-from analysis.stats.intervals import BandKind, Statistic
+from analysis.stats.curves import Axis, PlotOptions, Spread, Statistic
 from analysis.stats.scores import Measure
 from analysis.tables.rendering import (
     CALIBRATION,
@@ -84,12 +83,6 @@ def parser() -> Parser:
     )
     figures.add_argument(
         "--style", choices=list(Spread), default=Spread.BAND, help="intervals of figure 1"
-    )
-    figures.add_argument(
-        "--band",
-        choices=list(BandKind),
-        default=BandKind.CONFIDENCE,
-        help="intervals of figure 1: of the centre, or what holds 90 %% of the runs",
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     cores = usable_cores()
@@ -243,7 +236,6 @@ def _plot_options(options: argparse.Namespace) -> PlotOptions:
         "spread": ("style", Spread),
         "epsilon": ("epsilon", None),
         "color_by": ("color_by", None),
-        "band": ("band", BandKind),
     }
     found: dict[str, Any] = {
         field: kind(getattr(options, name)) if kind else getattr(options, name)

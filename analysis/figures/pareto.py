@@ -43,8 +43,7 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.stats.curves import log_limits
-from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
+from analysis.stats.curves import STUDENT_RANGE, Estimate, geometric_mean, log_limits
 from analysis.stats.scores import final_losses, on_front
 from analysis.style import (
     BLACK,

@@ -25,7 +25,7 @@ from analysis.data.selection import (
     policy_rank,
     unfinished,
 )
-from analysis.stats.intervals import CONFIDENCE, band, interval_of_mean
+from analysis.stats.curves import CONFIDENCE, band, interval_of_mean
 from analysis.style import but_diverged, but_lost, of_finished
 from orchestrate.store import Assessments, Reader
 

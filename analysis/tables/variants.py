@@ -36,7 +36,7 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.stats.intervals import mean_columns
+from analysis.stats.curves import mean_columns
 from analysis.stats.scores import (
     TrueModel,
     benjamini_hochberg,

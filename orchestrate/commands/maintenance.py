@@ -23,11 +23,12 @@ from orchestrate.commands.results import ListedTrial, listed, the_one
 from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, length_of_time, path
 from orchestrate.store import RETRIED, Reader, Store
-from orchestrate.store.doctor import Finding, examine
 from orchestrate.store.maintenance import (
+    Finding,
     Prunable,
     Upgrade,
     back_up,
+    examine,
     merge_collected,
     prunable,
     upgrade,

@@ -32,14 +32,6 @@ from orchestrate.runner.progress import (
     Tally,
     handling,
 )
-from orchestrate.runner.run_grid import (
-    WORK,
-    Output,
-    Work,
-    prepare_workers,
-    recorded_launch,
-    worked,
-)
 from orchestrate.runner.saving import RetryingStore, launch_record
 from orchestrate.runner.scheduler import (
     BYTES_PER_GIB,
@@ -48,6 +40,14 @@ from orchestrate.runner.scheduler import (
     Chunks,
     Scheduler,
     memory_of_this_machine,
+)
+from orchestrate.runner.start import (
+    WORK,
+    Output,
+    Work,
+    prepare_workers,
+    recorded_launch,
+    worked,
 )
 from orchestrate.store import OpenConfig
 
@@ -144,7 +144,7 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
     Raises
     ------
     StoreError, InfrastructureError
-        As :func:`orchestrate.runner.run_grid.launch_grid`.
+        As :func:`orchestrate.runner.start.launch_grid`.
     """
     repeated = Repetition()
 

@@ -25,7 +25,7 @@ from orchestrate.executors.base import Event, InProcessExecutor, Task
 from orchestrate.fingerprint import fingerprint
 from orchestrate.program import UsageError, length_of_time, visible
 from orchestrate.runner import worker
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner.start import Work
 from orchestrate.store import (
     Claim,
     ConfigRow,
