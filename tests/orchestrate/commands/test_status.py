@@ -55,11 +55,11 @@ class TestOnce:
     def test_counts_each_config(self, command: Run) -> None:
         table = rows(command("status").out)
         assert [" ".join(row) for row in table[:6]] == [
-            "env policy width done of failed diverged running pending",
-            "cartpole random - 0 2 - - - 2",
-            "cartpole random 8 0 1 - - 1 -",
-            "pendulum d_optimal 16 0 3 2 1 - -",
-            "pendulum random 16 3 3 - - - -",
+            "env label done of failed diverged running pending",
+            "cartpole random, width=None 0 2 - - - 2",
+            "cartpole random, width=8 0 1 - - 1 -",
+            "pendulum d_optimal 0 3 2 1 - -",
+            "pendulum random 3 3 - - - -",
             "total 3 9 2 1 1 2",
         ]
 
@@ -173,7 +173,10 @@ class TestTable:
 
     def test_what_tells_configurations_apart_is_shown(self, reader: Reader, store: Store) -> None:
         configs = self.configs(reader, store, [Spec(horizon=5), Spec(horizon=6)])
-        assert self.shown(configs, 10)[0][:4] == ["env", "policy", "width", "horizon"]
+        table = self.shown(configs, 10)
+        assert table[0][:2] == ["env", "label"]
+        labels = {" ".join(row[:3]) for row in table[1:3]}
+        assert labels == {"pendulum random, horizon=5", "pendulum random, horizon=6"}
 
     def shown(self, configs: list[ConfigRow], most: int) -> list[list[str]]:
         console = Console(file=io.StringIO(), width=200)
