@@ -298,8 +298,6 @@ def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 Interval = tuple[float, float, float]
 """Centre, low and high."""
 
-Estimate = Callable[[Array], Interval]
-
 
 @dataclass(frozen=True)
 class TrueModel:

@@ -459,7 +459,7 @@ def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
     assert truth.success_low < 3 / 5 < truth.success_high
     shown = shown[shown["variant"] == TRUTH]
     assert shown["t"].tolist() == [0, 20, 60]
-    assert (shown[["n", "lost", "success"]] == (truth.n, truth.lost, truth.success)).all(axis=None)
+    assert (shown[["n", "lost", "success"]] == [truth.n, truth.lost, truth.success]).all(axis=None)
 
 
 def test_a_grid_without_a_task_has_no_such_table(tmp_path: Path) -> None:
