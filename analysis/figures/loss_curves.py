@@ -36,12 +36,7 @@ from analysis.stats.curves import (
     measure_curves,
     tabulate_curves,
 )
-from analysis.style import (
-    GREY,
-    LineStyle,
-    count_text,
-    environment_title,
-)
+from analysis.style import GREY, LineStyle, count_text, environment_title
 from dopt.policies import policy_title
 
 PANEL_HEIGHT = 2.3

@@ -57,12 +57,7 @@ from analysis.stats.scores import (
     without_ratio,
 )
 from analysis.style import but_diverged
-from analysis.tables.comparisons import (
-    BySeed,
-    against_reference,
-    loss_of_random_inputs,
-    paired,
-)
+from analysis.tables.comparisons import BySeed, against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
 from dopt.policies import policy_title
 from dopt.spec.trial import is_prequential, system_of

@@ -24,14 +24,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task, make_executor
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
-from orchestrate.runner.progress import (
-    SIGNALS,
-    Interrupt,
-    Progress,
-    Repetition,
-    Tally,
-    handling,
-)
+from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally, handling
 from orchestrate.runner.saving import RetryingStore, launch_record
 from orchestrate.runner.scheduler import (
     BYTES_PER_GIB,
@@ -41,14 +34,7 @@ from orchestrate.runner.scheduler import (
     Scheduler,
     memory_of_this_machine,
 )
-from orchestrate.runner.start import (
-    WORK,
-    Output,
-    Work,
-    prepare_workers,
-    recorded_launch,
-    worked,
-)
+from orchestrate.runner.start import WORK, Output, Work, prepare_workers, recorded_launch, worked
 from orchestrate.store import OpenConfig
 
 WARNINGS = (*SIGNALS, signal.SIGUSR1)

@@ -13,12 +13,7 @@ from orchestrate.store.backends.base import Backend, parse_url
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
 from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
-from orchestrate.store.records import (
-    Claim,
-    LaunchRecord,
-    Registrable,
-    Registration,
-)
+from orchestrate.store.records import Claim, LaunchRecord, Registrable, Registration
 from orchestrate.store.results import Saved
 
 if TYPE_CHECKING:
