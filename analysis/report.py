@@ -17,7 +17,7 @@ import pandas as pd
 from analysis import outputs
 from analysis.data.matching import Filter
 from analysis.data.selection import Gap, Selection
-from analysis.stats.intervals import STUDENT_RANGE
+from analysis.stats.curves import STUDENT_RANGE
 from analysis.style import (
     but_diverged,
     but_lost,

@@ -18,7 +18,7 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import Claim, LaunchRecord, Reader, RunRecord, Store
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import code_tables
 from code_tables import markdown
 
-from analysis.stats.intervals import band, standard_error
+from analysis.stats.curves import band, standard_error
 from analysis.stats.scores import compare
 from analysis.style import number, plus_minus, share, within
 from studies.conclusions import tables as conclusions

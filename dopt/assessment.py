@@ -37,9 +37,9 @@ def true_forecast(system: System) -> Forecast:
     """Return the forecast by the system itself as it is at the first step, without noise."""
     if not system.compiled:
         return forecast_by_equations(system)
-    from dopt.kernel import forecast
+    from dopt.kernel import run
 
-    return forecast.true_forecast(system)
+    return run.true_forecast(system)
 
 
 def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
@@ -49,9 +49,9 @@ def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
     """
     if not (system.compiled and model.compiled and isinstance(model, (MLP, Linear))):
         return forecast_by(system, lambda x, u: model.predict(system, parameters, x, u))
-    from dopt.kernel import forecast
+    from dopt.kernel import run
 
-    return forecast.model_forecast(system, model, parameters)
+    return run.model_forecast(system, model, parameters)
 
 
 TURN = 2 * math.pi

@@ -27,15 +27,13 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import SpecificationError
-from dopt.evaluation import evaluation_set, random_transitions
+from dopt.evaluation import evaluation_set
 from dopt.models.base import MLP, Model
 from dopt.models.gaussian_process import GaussianProcess
-from dopt.policies.base import ball_norms, on_sphere
-from dopt.randomness import initial_weights, process_noise, stream
+from dopt.randomness import initial_weights
 from dopt.spec.compatibility import Information, held_information
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.black_box import BlackBox
 
 Array = npt.NDArray[np.float64]
 
@@ -56,44 +54,6 @@ class Samples:
     states: Array
     inputs: Array
     accelerations: Array
-
-
-def uniform_samples(spec: TrialSpec) -> Samples:
-    """Return as many samples as a trial has steps, at states drawn uniformly from its grid's box.
-
-    The noise is the trial's, w_t of equation 2. One step from a state x under any input is
-    observed as y = a(x) + w/dt in the learned rows: the known part, and with it the input, cancels.
-    Where the effect of the inputs is learned, they are drawn uniformly from the sphere ‖u‖ = γ, or
-    from the ball within for a model that is not affine in them.
-    State components without an axis in the grid are zero, as they are there. Of a system that
-    changes, the accelerations belong to the last step, by which the final loss is judged.
-
-    A black box that tells the truth at any state gives it, without noise. Other black boxes give
-    transitions of runs under random inputs, made as for the loss but with other inputs; there may
-    be fewer.
-    """
-    system, rng = spec.system, stream(spec.seed, "uniform_states")
-    states, inputs = _uniform_points(system, rng)
-    if not spec.model.affine_in_inputs:
-        inputs *= ball_norms(rng, (len(inputs), 1), system.n_inputs)
-    if isinstance(system, BlackBox):
-        truth = system.true_accelerations(states, inputs)
-        if truth is not None:
-            return Samples(states, inputs, truth)
-        rng = stream(spec.seed, "uniform_states")
-        return Samples(*random_transitions(system, system.horizon, rng))
-    noise = process_noise(system, spec.seed)[:, list(system.learned_rows)] / system.dt
-    accelerations = system.learned(states, system.horizon - 1, inputs)
-    return Samples(states, inputs, accelerations + noise)
-
-
-def _uniform_points(system: System, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return as many states, (N, d), and inputs, (N, m), as a trial has steps."""
-    states = np.zeros((system.horizon, system.n_states))
-    for index, (low, high) in system.grid_box().items():
-        states[:, index] = rng.uniform(low, high, system.horizon)
-    draws = rng.standard_normal((system.horizon, system.n_inputs))
-    return states, on_sphere(draws, system.gamma)
 
 
 def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
@@ -196,7 +156,7 @@ def fit_offline(
 
     θ₀ are the initial parameters of the trial, from which the fit of a network starts: damped
     Gauss-Newton (Levenberg-Marquardt) steps until the objective stays the same
-    (:mod:`dopt.kernel.learners.gauss_newton`). Each network of an ensemble is fitted by itself,
+    (:mod:`dopt.kernel.learners`). Each network of an ensemble is fitted by itself,
     from its own θ₀. A model that is linear in its parameters is solved for. Policy and learner of
     the trial make no difference.
 
@@ -321,9 +281,9 @@ def _fit_networks(
 def _fit_network(
     spec: TrialSpec, points: Array, accelerations: Array, initial: Array, ridge: float, most: int
 ) -> tuple[Array, int, bool]:
-    from dopt.kernel.learners.gauss_newton import Problem, fit
+    from dopt.kernel.from_spec import network_of
+    from dopt.kernel.learners import Problem, fit
     from dopt.kernel.pointers import compiled_for, kind_of
-    from dopt.kernel.state_from_spec import network_of
 
     network, features = (
         network_of(spec.system, spec.model),

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,10 @@ from dopt.assessment import assessed
 from dopt.errors import SpecificationError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+
+if TYPE_CHECKING:
+    from dopt.kernel.run import KernelTrial, SteppedTrial  # which loads the compiler
+    from dopt.reference.batch import ReferenceTrial
 
 Path = Literal["kernel", "reference"]
 
@@ -77,18 +81,6 @@ class Rerun:
     states: Array
 
 
-class Run(Protocol):
-    """A trial that can be advanced in pieces and looked at in between."""
-
-    @property
-    def diverged_at(self) -> int | None: ...
-    @property
-    def parameters(self) -> Array: ...
-    @property
-    def states(self) -> Array: ...
-    def advance(self, last: int) -> None: ...
-
-
 def rerun(spec: TrialSpec, steps: Sequence[int]) -> Rerun:
     """Run a trial on its path and note the parameters after ascending numbers of steps.
 
@@ -117,7 +109,7 @@ def rerun(spec: TrialSpec, steps: Sequence[int]) -> Rerun:
     return Rerun(np.array(seen, dtype=np.int64), np.array(parameters).reshape(-1, q), states)
 
 
-def _run(spec: TrialSpec) -> Run:
+def _run(spec: TrialSpec) -> KernelTrial | SteppedTrial | ReferenceTrial:
     if spec.config.path == "reference":
         from dopt.reference.batch import ReferenceTrial
 

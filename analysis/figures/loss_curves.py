@@ -36,13 +36,7 @@ from analysis.stats.curves import (
     measure_curves,
     tabulate_curves,
 )
-from analysis.stats.intervals import FEWEST, BandKind
-from analysis.style import (
-    GREY,
-    LineStyle,
-    count_text,
-    environment_title,
-)
+from analysis.style import GREY, LineStyle, count_text, environment_title
 from dopt.policies import policy_title
 
 PANEL_HEIGHT = 2.3
@@ -168,15 +162,6 @@ def _breaks(curves: Sequence[LossCurve]) -> str:
     return ""
 
 
-def _bandless(curves: Sequence[LossCurve], options: PlotOptions) -> str:
-    """Return which lines have no tolerance band, or nothing."""
-    if options.band is not BandKind.TOLERANCE:
-        return ""
-    few = [curve for curve in curves if curve.band.n < FEWEST]
-    lines = ", ".join(f"{environment_title(one.env)} {one.label} (n = {one.band.n})" for one in few)
-    return f"No band, as fewer than {FEWEST} trials have none: {lines}. " if few else ""
-
-
 def _title(env: str, counts: str) -> str:
     """Return the title of a panel in one line, or in more, none of which breaks a count."""
     if len(env) + len(counts) < 50:
@@ -220,8 +205,8 @@ def caption(numbers: Numbers) -> str:
     return (
         f"{_what(column, curves)} against time t, one panel per environment. "
         f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
-        f"{options.interval}; no smoothing. {_bandless(curves, options)}"
-        f"{_breaks(curves)}{rules[options.rule]} Policies of one environment share initial "
+        f"{options.interval}; no smoothing. {_breaks(curves)}"
+        f"{rules[options.rule]} Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -43,8 +43,7 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.stats.curves import log_limits
-from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
+from analysis.stats.curves import STUDENT_RANGE, geometric_mean, log_limits
 from analysis.stats.scores import final_losses, on_front
 from analysis.style import (
     BLACK,
@@ -85,14 +84,15 @@ class Point:
     ----------
     label : str
         Settings that differ among the configurations of the environment.
-    policy, policy_words, learner_words : str
+    policy, policy_label, learner_label : str
         Name of the policy; the policy and the learner with their settings that differ. The
         learner's are followed by the model, where it is another one than the network.
-    us : float
+    us_per_step : float
         Microseconds of planning and learning in a step: mean over the steps of a trial, median over
         trials that did not diverge; NaN without any.
-    loss : Estimate
-        Final loss, geometric mean over trials, in ``unit``; NaN where none is left.
+    loss, low, high : float
+        Final loss, geometric mean over trials with its interval, in ``unit``; NaN where none is
+        left.
     n, n_finished, n_diverged : int
         Trials in the loss, trials that ended, and how many of these diverged.
     counts : str
@@ -107,10 +107,12 @@ class Point:
     env: str
     label: str
     policy: str
-    policy_words: str
-    learner_words: str
-    us: float
-    loss: Estimate
+    policy_label: str
+    learner_label: str
+    us_per_step: float
+    loss: float
+    low: float
+    high: float
     unit: str
     n: int
     n_finished: int
@@ -122,7 +124,7 @@ class Point:
     @property
     def known(self) -> bool:
         """True if the point can be drawn."""
-        return bool(np.isfinite(self.us) and np.isfinite(self.loss.value))
+        return bool(np.isfinite(self.us_per_step) and np.isfinite(self.loss))
 
 
 Points = tuple[Point, ...]
@@ -187,15 +189,17 @@ def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
 
 def _point(reader: Reader, entry: Entry, policy: str, learner: str, rule: DivergenceRule) -> Point:
     scores = final_losses(reader, entry, "loss", rule)
-    system = system_of(entry.config.config)
+    system, loss = system_of(entry.config.config), geometric_mean(scores.values)
     return Point(
         env=entry.config.env,
         label=entry.label,
         policy=entry.config.policy,
-        policy_words=policy,
-        learner_words=learner,
-        us=step_us(reader, entry),
-        loss=geometric_mean(scores.values),
+        policy_label=policy,
+        learner_label=learner,
+        us_per_step=step_us(reader, entry),
+        loss=loss.value,
+        low=loss.low,
+        high=loss.high,
         unit=loss_unit(system),
         n=len(scores.by_seed),
         n_finished=scores.n_finished,
@@ -220,42 +224,26 @@ def step_us(reader: Reader, entry: Entry) -> float:
 
 def _with_front(points: Sequence[Point]) -> Iterator[Point]:
     """Yield the points of an environment by their time, with their place on the front."""
-    front = on_front(np.array([(point.us, point.loss.value) for point in points]))
+    front = on_front(np.array([(point.us_per_step, point.loss) for point in points]))
     placed = [replace(one, on_front=bool(is_on)) for one, is_on in zip(points, front, strict=True)]
-    yield from sorted(placed, key=lambda one: (not one.known, one.us))
+    yield from sorted(placed, key=lambda one: (not one.known, one.us_per_step))
 
 
 def policies_of(points: Points) -> dict[str, str]:
     """Return the words of the policies with their names, in the order of the titles."""
-    found = {point.policy_words: point.policy for point in points}
+    found = {point.policy_label: point.policy for point in points}
     return dict(sorted(found.items(), key=lambda one: (policy_rank(one[1]), len(one[0]), one[0])))
 
 
 def learners_of(points: Points) -> tuple[str, ...]:
     """Return the words of the learners by name."""
-    return tuple(sorted({point.learner_words for point in points}))
+    return tuple(sorted({point.learner_label for point in points}))
 
 
 def tabulate_points(points: Points) -> pd.DataFrame:
     """Return what is drawn, one row for each environment and configuration."""
-    return pd.DataFrame([_row(point) for point in points])
-
-
-def _row(point: Point) -> Mapping[str, object]:
-    return {
-        "env": point.env,
-        "label": point.label,
-        "policy": point.policy,
-        "policy_label": point.policy_words,
-        "learner_label": point.learner_words,
-        "us_per_step": point.us,
-        "loss": point.loss.value,
-        "low": point.loss.low,
-        "high": point.loss.high,
-        "n": point.n,
-        "n_diverged": point.n_diverged,
-        "on_front": point.on_front,
-    }
+    table = pd.DataFrame([asdict(point) for point in points])
+    return table.drop(columns=["unit", "n_finished", "counts", "limit_us"])
 
 
 Numbers = tuple[DivergenceRule, Points]
@@ -299,10 +287,10 @@ def _panel(
     known = [point for point in points if point.known]
     front = [point for point in known if point.on_front]
     for point in known:
-        _dot(axes, point, colours[point.policy_words], markers[point.learner_words])
+        _dot(axes, point, colours[point.policy_label], markers[point.learner_label])
     _limits(axes, known)
     if front:  # as steps
-        times, losses = [one.us for one in front], [one.loss.value for one in front]
+        times, losses = [one.us_per_step for one in front], [one.loss for one in front]
         steps = ([times[0], *times, axes.get_xlim()[1]], [axes.get_ylim()[1], *losses, losses[-1]])
         axes.plot(*steps, drawstyle="steps-post", color=BLACK, lw=0.7, zorder=2)
     usual = _counts(points).partition(";")[0]
@@ -312,11 +300,10 @@ def _panel(
 
 
 def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
-    loss = point.loss
-    ends = half_widths([loss.value], [loss.low], [loss.high])
+    ends = half_widths([point.loss], [point.low], [point.high])
     face = "white" if point.n_diverged else colour
     axes.errorbar(
-        point.us, loss.value, yerr=ends, fmt=marker, ms=4.2 if point.on_front else 3.4,
+        point.us_per_step, point.loss, yerr=ends, fmt=marker, ms=4.2 if point.on_front else 3.4,
         color=colour, mfc=face, mec=BLACK if point.on_front else colour, mew=0.6, elinewidth=0.6,
         alpha=1.0 if point.on_front else 0.6, zorder=4 if point.on_front else 3,
     )  # fmt: skip
@@ -324,8 +311,8 @@ def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
 
 def _limits(axes: Axes, known: Sequence[Point]) -> None:
     """Set logarithmic axes around all points, and mark the time between two steps."""
-    times = np.array([point.us for point in known])
-    ends = [(one.loss.value, one.loss.low, one.loss.high) for one in known]
+    times = np.array([point.us_per_step for point in known])
+    ends = [(one.loss, one.low, one.high) for one in known]
     left, right = log_limits(times, margin=1.6)
     log_scale(axes, left, right, "x")
     log_scale(axes, *log_limits(np.array(ends).ravel(), margin=1.3))

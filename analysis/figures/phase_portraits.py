@@ -33,8 +33,14 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.stats.curves import DrawnPlane, Spectrum, average_spectrum, median_seed
-from analysis.stats.intervals import mean, standard_error
+from analysis.stats.curves import (
+    DrawnPlane,
+    Spectrum,
+    average_spectrum,
+    mean,
+    median_seed,
+    standard_error,
+)
 from analysis.style import (
     BLACK,
     but_diverged,

@@ -24,11 +24,11 @@ from analysis.stats.curves import (
     LossCurve,
     PlotOptions,
     axis_parts,
+    mean_columns,
     measure_curves,
     periodogram,
     tabulate_curves,
 )
-from analysis.stats.intervals import mean_columns
 from analysis.style import policy_style
 from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError

@@ -25,8 +25,8 @@ from analysis.data.selection import (
     policy_rank,
     unfinished,
 )
-from analysis.stats.intervals import CONFIDENCE, band, interval_of_mean
-from analysis.style import but_diverged, but_lost, of_finished
+from analysis.stats.curves import CONFIDENCE, band, interval_of_mean
+from analysis.style import of_finished
 from orchestrate.store import Assessments, Reader
 
 Array = npt.NDArray[np.float64]
@@ -298,8 +298,6 @@ def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 Interval = tuple[float, float, float]
 """Centre, low and high."""
 
-Estimate = Callable[[Array], Interval]
-
 
 @dataclass(frozen=True)
 class TrueModel:
@@ -314,47 +312,6 @@ class TrueModel:
     success_low: float
     success_high: float
     lost: int
-
-
-@dataclass(frozen=True)
-class ControlCurve:
-    """Success and cost of the models of one policy in one environment, after k numbers of steps.
-
-    Attributes
-    ----------
-    t, n : (k,)
-        Explored steps, and trials that reached them.
-    success, success_low, success_high : (k,)
-        Share of successful episodes, with its Wilson interval of 95 %.
-    cost, cost_low, cost_high : (k,)
-        Geometric mean of the cost by the true model's, with Student's interval of 95 %.
-    lost : (k,)
-        Episodes of the n that are in no mean of costs: of no finite cost, their own or the true
-        model's of the same seed.
-    truth : TrueModel
-        Of the seeds of all policies in the environment.
-    described : str
-        Number of trials, and how many diverged.
-    """
-
-    env: str
-    policy: str
-    t: npt.NDArray[np.int64]
-    n: npt.NDArray[np.int64]
-    success: Array
-    success_low: Array
-    success_high: Array
-    cost: Array
-    cost_low: Array
-    cost_high: Array
-    lost: npt.NDArray[np.int64]
-    truth: TrueModel
-    described: str
-
-    @property
-    def counts(self) -> str:
-        """The number of trials, and of the episodes that were lost after any of the steps."""
-        return but_lost(self.described, int(np.sum(self.lost)))
 
 
 def control_part(selection: Selection) -> Selection:
@@ -399,14 +356,7 @@ def task_of(entry: Entry) -> str | None:
     return json.dumps(task, sort_keys=True) if task and entry.final_losses() else None
 
 
-def measure_control(reader: Reader, selection: Selection) -> tuple[ControlCurve, ...]:
-    """Return a curve for each entry."""
-    with reader.moment() as moment:
-        truths = {env: true_model(moment, selection.of(env)) for env in selection.environments}
-        return tuple(_curve(moment, entry, truths[entry.config.env]) for entry in selection.entries)
-
-
-def _measured(reader: Reader, entry: Entry, *measures: str) -> list[Assessments]:
+def measured(reader: Reader, entry: Entry, *measures: str) -> list[Assessments]:
     """Return measures of the trials that the entry holds as finished, all of one moment."""
     seeds = [trial.seed for trial in entry.finished]
     with reader.moment() as moment:
@@ -427,47 +377,19 @@ def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
     costs: dict[int, float] = {}
     with reader.moment() as moment:
         for entry in entries:
-            own = _measured(moment, entry, "true_model_success", "true_model_cost")
-            for total, measured in zip((successes, costs), own, strict=True):
-                total.update(_first(measured))
-    found = np.array(list(successes.values()))
+            own = measured(moment, entry, "true_model_success", "true_model_cost")
+            for total, found in zip((successes, costs), own, strict=True):
+                total.update(_first(found))
     known = [seed for seed, success in successes.items() if np.isfinite(success)]
-    finite = _usable(np.array([costs.get(seed, np.nan) for seed in known]))
-    return TrueModel(len(known), *_rate(found), int(np.sum(~finite)))
+    finite = usable(np.array([costs.get(seed, np.nan) for seed in known]))
+    return TrueModel(
+        len(known), *success_rate(np.array(list(successes.values()))), int(np.sum(~finite))
+    )
 
 
 def _first(found: Assessments) -> dict[int, float]:
     """Return the number of each seed after the first number of steps."""
     return dict(zip(found.seeds.tolist(), found.values[:, :1].ravel().tolist(), strict=True))
-
-
-def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
-    with reader.moment() as moment:
-        (successes,) = _measured(moment, entry, "control_success")
-        ratios = relative_costs(moment, entry).values
-    reached = np.isfinite(successes.values)
-    success, success_low, success_high = _by_step(_rate, successes.values)
-    cost, cost_low, cost_high = _by_step(geometric_mean, ratios)
-    return ControlCurve(
-        entry.config.env,
-        entry.config.policy,
-        successes.t,
-        np.sum(reached, axis=0),
-        success,
-        success_low,
-        success_high,
-        cost,
-        cost_low,
-        cost_high,
-        np.sum(reached & ~_usable(ratios), axis=0),
-        truth,
-        but_diverged(len(successes.seeds), int(np.sum(successes.diverged))),
-    )
-
-
-def _by_step(estimate: Estimate, values: Array) -> Array:
-    """Return centre, low and high, (3, k), of values (n, k) at each step."""
-    return np.array([estimate(column) for column in values.T]).reshape(-1, 3).T
 
 
 def relative_costs(reader: Reader, entry: Entry) -> Assessments:
@@ -477,15 +399,15 @@ def relative_costs(reader: Reader, entry: Entry) -> Assessments:
     true model's has no finite cost, so that nothing can be said.
     """
     measures = "control_cost", "control_success", "true_model_cost"
-    costs, successes, truths = _measured(reader, entry, *measures)
+    costs, successes, truths = measured(reader, entry, *measures)
     reached, of_seed = np.isfinite(successes.values), _first(truths)
     divisors = np.array([of_seed.get(seed, np.nan) for seed in costs.seeds.tolist()])
-    divisors = np.where(_usable(divisors), divisors, np.nan)
+    divisors = np.where(usable(divisors), divisors, np.nan)
     values = np.where(reached & ~np.isfinite(costs.values), np.inf, costs.values)
     return Assessments(costs.seeds, costs.t, values / divisors[:, None], costs.diverged)
 
 
-def _rate(successes: Array) -> Interval:
+def success_rate(successes: Array) -> Interval:
     """Return the share of successes among (n,), NaN left out, with its Wilson interval."""
     known = successes[np.isfinite(successes)]
     if not len(known):
@@ -497,14 +419,14 @@ def _rate(successes: Array) -> Interval:
     return float(np.mean(known)), float(interval.low), float(interval.high)
 
 
-def _usable(values: Array) -> npt.NDArray[np.bool_]:
+def usable(values: Array) -> npt.NDArray[np.bool_]:
     """Return which costs or ratios have a logarithm."""
     return np.isfinite(values) & (values > 0)
 
 
 def geometric_mean(ratios: Array) -> Interval:
     """Return the geometric mean of the finite ones of (n,), with Student's interval."""
-    known = np.log(ratios[_usable(ratios)])
+    known = np.log(ratios[usable(ratios)])
     found = band(known[:, None])
     centre, low, high = (float(np.exp(end[0])) for end in (found.centre, found.low, found.high))
     return centre, low, high
@@ -517,7 +439,7 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
     """
     with reader.moment() as moment:
         costs = relative_costs(moment, entry)
-        (successes,) = _measured(moment, entry, "control_success")
+        (successes,) = measured(moment, entry, "control_success")
     reached = np.isfinite(successes.values)
     at = costs.t == t
     seeds = costs.seeds[reached[:, at].any(axis=1)]

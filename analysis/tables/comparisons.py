@@ -21,7 +21,7 @@ import pandas as pd
 from analysis.data.matching import AnalysisError, nearness
 from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
-from analysis.stats.intervals import Statistic, centre, mean_columns, stratified_mean
+from analysis.stats.curves import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
     Measure,
@@ -279,7 +279,7 @@ def aggregate(
     """Return the ratio of final losses over all systems, one row for each variant.
 
     It is the geometric mean over systems of the geometric means over shared seeds of variant /
-    reference, with the interval of :func:`analysis.stats.intervals.stratified_mean`. Every system
+    reference, with the interval of :func:`analysis.stats.curves.stratified_mean`. Every system
     counts alike. A variant is compared over those that have it: ``systems``.
 
     Raises

@@ -16,8 +16,7 @@ from tabulate import tabulate
 from analysis.data.matching import AnalysisError, IncompleteError
 from analysis.data.samples import learned_model, sample_losses, simulated_trial
 from analysis.data.selection import Entry, Gap, Selection
-from analysis.stats.curves import PlotOptions
-from analysis.stats.intervals import STUDENT_RANGE
+from analysis.stats.curves import STUDENT_RANGE, PlotOptions
 from analysis.stats.scores import Measure, control_part, geometric_mean
 from analysis.style import (
     but_diverged,

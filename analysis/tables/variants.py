@@ -28,7 +28,6 @@ from analysis.data.matching import (
 from analysis.data.samples import DivergenceRule, coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
-    Selection,
     environment_rank,
     labels_of,
     one_each,
@@ -36,7 +35,7 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.stats.intervals import mean_columns
+from analysis.stats.curves import mean_columns
 from analysis.stats.scores import (
     TrueModel,
     benjamini_hochberg,
@@ -44,20 +43,21 @@ from analysis.stats.scores import (
     common_task,
     compare_hitting_times,
     final_losses,
+    geometric_mean,
     lasting_steps,
     mcnemar,
     mean_losses,
-    measure_control,
+    measured,
+    relative_costs,
     scores_at,
+    success_rate,
     task_of,
+    true_model,
+    usable,
     without_ratio,
 )
-from analysis.tables.comparisons import (
-    BySeed,
-    against_reference,
-    loss_of_random_inputs,
-    paired,
-)
+from analysis.style import but_diverged
+from analysis.tables.comparisons import BySeed, against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
 from dopt.policies import policy_title
 from dopt.spec.trial import is_prequential, system_of
@@ -356,28 +356,35 @@ def tabulate_control_of(reader: Reader, groups: Sequence[VariantGroup]) -> pd.Da
 
 
 def _control_rows(reader: Reader, group: VariantGroup) -> Iterator[dict[str, object]]:
-    assessed = group.assessed
-    curves = measure_control(reader, Selection(assessed))
-    successes = [reader.assessments(one.config.config_key, SUCCESS) for one in assessed]
-    reference = successes[0] if assessed[0] is group.reference else None
-    for one, curve, own in zip(assessed, curves, successes, strict=True):
-        losses = read_curves(reader, one, "loss").values
-        free_runs = reader.assessments(one.config.config_key, FREE_RUN)
-        for k, t in enumerate(curve.t.tolist()):
-            yield {
-                "env": group.env,
-                "variant": one.label,
-                "t": t,
-                "n": int(curve.n[k]),
-                **{name: float(getattr(curve, name)[k]) for name in ESTIMATES},
-                "lost": int(curve.lost[k]),
-                "success_p": _test(own, reference, t),
-                "loss": _geometric_mean(losses[:, t - 1]) if t else math.nan,
-                **_free_run(free_runs, t, int(curve.n[k])),
-                "described": curve.described,
-            }
-    steps = sorted({int(t) for curve in curves for t in curve.t})
-    yield from (_truth(group.env, curves[0].truth, t) for t in steps)
+    """Yield a row for each assessed variant and number of steps, all of one moment.
+
+    Success: share with its Wilson interval. Cost: geometric mean of the cost by the true model's
+    with Student's interval. Lost: episodes in no mean of costs.
+    """
+    steps: set[int] = set()
+    reference = None
+    with reader.moment() as moment:
+        truth = true_model(moment, group.assessed)
+        for one in group.assessed:
+            (own,) = measured(moment, one, SUCCESS)
+            reference = own if one is group.reference else reference
+            ratios = relative_costs(moment, one).values
+            losses = read_curves(moment, one, "loss").values
+            free_runs = moment.assessments(one.config.config_key, FREE_RUN)
+            for k, t in enumerate(own.t.tolist()):
+                reached = np.isfinite(own.values[:, k])
+                estimates = *success_rate(own.values[:, k]), *geometric_mean(ratios[:, k])
+                yield {
+                    **{"env": group.env, "variant": one.label, "t": t, "n": int(np.sum(reached))},
+                    **dict(zip(ESTIMATES, estimates, strict=True)),
+                    "lost": int(np.sum(reached & ~usable(ratios[:, k]))),
+                    "success_p": _test(own, reference, t),
+                    "loss": geometric_mean(losses[:, t - 1])[0] if t else math.nan,
+                    **_free_run(free_runs, t, int(np.sum(reached))),
+                    "described": but_diverged(len(own.seeds), int(np.sum(own.diverged))),
+                }
+            steps |= set(own.t.tolist())
+    yield from (_truth(group.env, truth, t) for t in sorted(steps))
 
 
 def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
@@ -405,11 +412,6 @@ def _at(found: Assessments, t: int) -> dict[int, float]:
     """Return the number of each seed that reached t steps."""
     rows, columns = np.nonzero(np.isfinite(found.values) & (found.t == t))
     return dict(zip(found.seeds[rows].tolist(), found.values[rows, columns].tolist(), strict=True))
-
-
-def _geometric_mean(values: Array) -> float:
-    known = values[np.isfinite(values) & (values > 0)]
-    return float(np.exp(np.mean(np.log(known)))) if len(known) else math.nan
 
 
 def _free_run(found: Assessments, t: int, reached: int) -> dict[str, object]:

@@ -17,16 +17,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from dopt.arguments import (
-    finite,
-    instance,
-    measured,
-    numbers,
-    safe_input,
-    seconds,
-    whole,
-    within,
-)
+from dopt.arguments import finite, instance, measured, numbers, safe_input, seconds, whole, within
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside, first_evidence, first_simulation

@@ -13,8 +13,8 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.explorer.refit import Found
 from dopt.fitting.fit import fit
+from dopt.kernel import learners
 from dopt.kernel.evidence import Request, fit_rows
-from dopt.kernel.learners import gauss_newton
 from dopt.log import Log
 from dopt.systems.plant import Plant
 from dopt.types import Array
@@ -33,9 +33,9 @@ def _answer(request: Any) -> Found | Array:
         return fit_rows(request)
     if isinstance(request[0], Plant):
         return _found(*request)
-    problem: gauss_newton.Problem = request[0]
+    problem: learners.Problem = request[0]
     theta: Array = request[1]
-    gauss_newton.fit(problem, theta, MOST_STEPS)
+    learners.fit(problem, theta, MOST_STEPS)
     return theta
 
 

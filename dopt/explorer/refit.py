@@ -29,7 +29,7 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     from dopt.kernel.evidence import Request  # which loads the compiler
-    from dopt.kernel.learners.gauss_newton import Problem
+    from dopt.kernel.learners import Problem
 
     FitRequest = tuple[Plant, Log, int, int] | Request | tuple[Problem, Array]
     """What a fit is given: plant, log, units of the network, seed; samples of processes; or a

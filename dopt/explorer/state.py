@@ -35,7 +35,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,8 +54,12 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     from dopt.explorer.refit import FitRequest
-    from dopt.kernel.evidence import Evidence  # which loads the compiler
+    from dopt.kernel.run import KernelSteps  # which loads the compiler
     from dopt.kernel.structs import Trial
+    from dopt.reference.batch import ReferenceSteps
+
+    Steps = KernelSteps | ReferenceSteps
+    """The steps of a trial, in the kernel or in the reference."""
 
 REMEMBERED = 1000
 """Inputs that are kept for another delay or lag; what was before the first is taken for it."""
@@ -216,28 +220,6 @@ MANY_JUMPS = 10
 _log = logging.getLogger("dopt.explorer")
 
 
-class Steps(Protocol):
-    """The steps of a trial, in the kernel or in the reference."""
-
-    @property
-    def states(self) -> Array: ...
-    @property
-    def inputs(self) -> Array: ...
-    @property
-    def parameters(self) -> Array: ...
-    @property
-    def errors(self) -> Array: ...
-    @property
-    def evidence(self) -> Evidence | None: ...
-    def measure(self, t: int, measured: Array) -> None: ...
-    def reached(self, t: int, inputs: Array, seconds: Array) -> Array: ...
-    def note_asked(self, u: Array) -> None: ...
-    def plan_input(self, t: int) -> None: ...
-    def begin(self, t: int, state: Array) -> None: ...
-    def replace(self, parameters: Array, constants: Array) -> None: ...
-    def take_in(self, t: int, dt: float) -> bool: ...
-
-
 class ExplorerState:
     """Measurements of an exploration and the model that was learned from them.
 
@@ -339,11 +321,11 @@ class ExplorerState:
 
     @property
     def _trial(self) -> Trial:
-        trial: Trial = self.steps.trial  # type: ignore[attr-defined]  # of a learner of the kernel
+        trial: Trial = self.steps.trial  # type: ignore[union-attr]  # of a learner of the kernel
         return trial
 
     def _samples(self, learner: GaussNewton) -> FitRequest:
-        from dopt.kernel.learners.gauss_newton import Problem
+        from dopt.kernel.learners import Problem
 
         trial = self._trial
         features, targets = trial.state.window_features, trial.state.window_targets
@@ -542,7 +524,7 @@ def _steps_of(spec: TrialSpec) -> Steps:
         from dopt.reference.batch import ReferenceSteps
 
         return ReferenceSteps(spec)
-    from dopt.kernel.steps import KernelSteps
+    from dopt.kernel.run import KernelSteps
 
     return KernelSteps(spec)
 

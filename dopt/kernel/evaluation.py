@@ -9,7 +9,7 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled
 from dopt.kernel.gaussian_process import mean_weights
-from dopt.kernel.model_kinds import write_values
+from dopt.kernel.model import write_values
 from dopt.kernel.network import mean_forward
 from dopt.kernel.structs import Evaluation, Network, Plant
 from dopt.kernel.vectors import inner, multiply

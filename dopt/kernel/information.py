@@ -25,7 +25,6 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel import model_kinds
 from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.linear_algebra import (
     factorize,
@@ -42,6 +41,7 @@ from dopt.kernel.model import (
     write_jacobian,
     write_model_gradients,
     write_network_gradients,
+    write_normal_equations,
 )
 from dopt.kernel.network import features_at, multiply_vector, output_inputs_along, output_inputs_at
 from dopt.kernel.normal_equations import normal_matrix
@@ -175,9 +175,7 @@ def add_fresh_rows(plant: Plant, network: Network, state: State, x: Vector) -> N
         normal_matrix(network, state.theta, seen, r, normal)
     else:
         nothing, slope = np.zeros((r, n + 1)), np.empty(q)
-        model_kinds.write_normal_equations(
-            plant, network, state.theta, seen, nothing, normal, slope
-        )
+        write_normal_equations(plant, network, state.theta, seen, nothing, normal, slope)
     for i in range(q):
         normal[i, i] += visited.regularization
     if not (factorize(normal) and write_inverse(normal, covariance.upper)):

@@ -13,8 +13,8 @@ import numpy as np
 from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import add_stage, n_stages, predicted_state, write_rate
-from dopt.kernel.learners.adam import sampled_point
-from dopt.kernel.learners.joint_kalman import acceleration_variances, state_variances
+from dopt.kernel.joint_kalman import acceleration_variances, state_variances
+from dopt.kernel.learners import sampled_point
 from dopt.kernel.model import model_accelerations, model_point
 from dopt.kernel.sensors import has_sensors
 from dopt.kernel.structs import Limits, Trial

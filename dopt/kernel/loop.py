@@ -2,7 +2,7 @@
 
 An exploration of a plant (:class:`dopt.explorer.Explorer`) consists of :func:`plan_input` and
 :func:`take_in`; a trial puts between them the simulated system, or a black box that the interpreter
-steps (:mod:`dopt.kernel.steps`). Where a policy or a learner is written in numpy, the interpreter
+steps (:mod:`dopt.kernel.run`). Where a policy or a learner is written in numpy, the interpreter
 calls it between compiled steps, and the model answers its questions with the parameters of the
 moment (of an ensemble: of its first member).
 """
@@ -22,7 +22,7 @@ from dopt.kernel.evaluation import (
 from dopt.kernel.gaussian_process import add_to_points
 from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.integration import input_columns, next_model_state, next_true_state
-from dopt.kernel.learners.adam import sampled_point
+from dopt.kernel.learners import sampled_point
 from dopt.kernel.model import (
     model_accelerations,
     rows_at,

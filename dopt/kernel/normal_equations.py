@@ -17,8 +17,7 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, squared
-from dopt.kernel.network import output_inputs
-from dopt.kernel.network_gradients import batch_back_signals
+from dopt.kernel.network import batch_back_signals, output_inputs
 from dopt.kernel.structs import Network
 from dopt.kernel.vectors import inner_products
 from dopt.types import Matrix, Stack, Vector

@@ -23,7 +23,7 @@ from dopt.kernel.integration import (
 )
 from dopt.kernel.linear_algebra import factorize
 from dopt.kernel.model import model_point
-from dopt.kernel.search.path import advance_paths, keep_points, paths_from
+from dopt.kernel.search import advance_paths, keep_points, paths_from
 from dopt.kernel.structs import Trial
 from dopt.kernel.vectors import inner
 from dopt.sphere import sphere_maximizer

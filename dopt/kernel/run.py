@@ -1,22 +1,387 @@
-"""Runs of a trial in the compiled kernel, whole or in pieces."""
+"""Runs of a trial in the compiled kernel: whole, in pieces, or step by step; and forecasts.
+
+Where parts are written in numpy, or states come from outside, the interpreter takes the steps one
+by one. Forecasts follow many paths at once, under a model or the truth
+(:mod:`dopt.control.planning`).
+"""
 
 from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
+from numba import float64
 
+from dopt.control.planning import Forecast
 from dopt.control.task import Feedback
+from dopt.custom_planner import custom_planner
 from dopt.errors import SpecificationError
-from dopt.kernel.from_spec import KernelState, points_of_trial, shared_points
-from dopt.kernel.held import HeldTrial
-from dopt.kernel.pointers import Compiled, compiled_trial
-from dopt.kernel.steps import SteppedTrial, is_stepped
-from dopt.policies.base import CompiledPolicy, check_norms
+from dopt.kernel import loop
+from dopt.kernel.from_spec import KernelState, network_of, plant_of, points_of_trial, shared_points
+from dopt.kernel.held import HeldPlantType, HeldTrial, hold_plant
+from dopt.kernel.integration import (
+    follow_equations,
+    follow_network,
+)
+from dopt.kernel.linear_algebra import dense
+from dopt.kernel.loop import act_next, evaluate_next, learn_next, observe_next
+from dopt.kernel.pointers import (
+    BETWEEN,
+    Compiled,
+    compiled_evaluation,
+    compiled_for,
+    compiled_step,
+    compiled_steps,
+    compiled_trial,
+    kind_of,
+)
+from dopt.kernel.structs import Trial
+from dopt.learning.base import CustomLearner, Updater, check_update
+from dopt.models import MLP
+from dopt.models.base import Model
+from dopt.policies.base import CompiledPolicy, Planner, check_choice, check_norms
+from dopt.randomness import episode_seed, stream
 from dopt.result import TrialResult
+from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
-from dopt.types import Array
+from dopt.systems.base import System, with_inputs
+from dopt.systems.black_box import BlackBox, new_start, start_variances
+from dopt.trial_view import TrialView
+from dopt.types import Array, CompiledFunction
+
+
+class NumpyParts:
+    """The plan and the updates of one trial that are written in numpy, if it has such parts.
+
+    Attributes
+    ----------
+    targets : (T, r)
+        Accelerations observed in each step.
+    """
+
+    def __init__(self, spec: TrialSpec, trial: Trial, held: HeldTrial) -> None:
+        self._spec, self._trial, self._held = spec, trial, held
+        self._queries: dict[CompiledFunction, CompiledFunction] = {}
+        policy, learner, system = spec.policy, spec.learner, spec.system
+        self._planner: Planner | None = None
+        self._updater: Updater | None = None
+        if policy.is_in_numpy():
+            self._planner = custom_planner(spec)
+        if learner.is_in_numpy() and isinstance(learner, CustomLearner):
+            self._updater = learner.updater(system, stream(spec.seed, "updater"))
+        self.targets = np.full((system.horizon, system.n_learned), np.nan)
+
+    @staticmethod
+    def needed_by(config: TrialConfig) -> bool:
+        """Return whether the policy or the learner is written in numpy."""
+        return config.policy.is_in_numpy() or config.learner.is_in_numpy()
+
+    @property
+    def feedback(self) -> Feedback | None:
+        """The law of feedback that the plan has learned; None where it learns none."""
+        return self._planner.feedback() if self._planner else None
+
+    def choose(self, t: int, u: Array) -> float:
+        """Write the input, (m,), that the plan chooses at x_t, and return its time [µs].
+
+        Raises
+        ------
+        SpecificationError
+            If it has the wrong shape or a norm above γ.
+        """
+        if self._planner is None or t == 0:
+            return 0.0
+        start = time.perf_counter()
+        chosen = np.asarray(self._planner.choose(self._view(t)), dtype=np.float64)
+        seconds = time.perf_counter() - start
+        check_choice(self._spec.policy.name, chosen, t, self._spec.system)
+        u[:] = chosen
+        return 1e6 * seconds
+
+    def update(self, t: int) -> float:
+        """Write the parameters that the learner returns after step t, and return its time [µs].
+
+        Raises
+        ------
+        SpecificationError
+            If there are not as many as before.
+        """
+        if self._updater is None:
+            return 0.0
+        start, theta = time.perf_counter(), self._trial.state.theta
+        updated = np.asarray(self._updater.update(self._view(t + 1)), dtype=np.float64)
+        seconds = time.perf_counter() - start
+        check_update(self._spec.learner.name, updated, theta.shape)
+        theta[:] = updated
+        return 1e6 * seconds
+
+    def note(self, t: int) -> float:
+        """Let the plan take in step t, which was learned from, and return its time [µs]."""
+        start = time.perf_counter()
+        if self._planner:
+            self._planner.observe(self._view(t + 1))
+        return 1e6 * (time.perf_counter() - start)
+
+    def _view(self, t: int) -> KernelTrialView:
+        return KernelTrialView(self._spec.system, self._trial, self.targets, t, self._ask)
+
+    def _ask(self, query: CompiledFunction, *arrays: Array) -> None:
+        """Call a function of the model, which is compiled when it is first asked."""
+        if query not in self._queries:
+            self._queries[query] = compiled_step(self._trial, query)
+        self._queries[query](self._held, *arrays)
+
+
+class KernelTrialView(TrialView):
+    """A trial of the kernel after t steps; its arrays cannot be written into.
+
+    ``ask`` calls a function of :mod:`dopt.kernel.loop` with arrays.
+    """
+
+    def __init__(
+        self, system: System, trial: Trial, targets: Array, t: int, ask: Callable[..., None]
+    ) -> None:
+        record, state = trial.record, trial.state
+        self.system, self.t = system, t
+        self._ask, self._size = ask, len(state.theta)
+        self._covariance, self._row_scale = state.covariance, trial.algorithm.search.row_scale
+        self._point_size = system.n_states + trial.network.n_inputs_read
+        self.states, self.inputs = _fixed(record.states[: t + 1]), _fixed(record.inputs[:t])
+        self.sampled_inputs = _fixed(state.estimate.inputs[:t])
+        self.accelerations = _fixed(targets[:t])
+        self.parameters = state.theta.copy()
+        last, ties = t == system.horizon, trial.randomness.ties
+        self.tie = np.full(system.n_inputs, np.nan) if last else _fixed(ties[t])
+
+    @functools.cached_property
+    def sampled(self) -> Array:  # type: ignore[override]  # computed where it is asked for
+        """States at which the accelerations were observed, (t, d)."""
+        return self.system.sampled_states(self.states)
+
+    def points(self, states: Array, inputs: Array) -> Array:
+        return with_inputs(states, inputs, self._point_size - self.system.n_states)
+
+    def predict(self, states: Array) -> Array:
+        points = _given("states", states, None, self._point_size)
+        out = np.empty((len(points), self.system.n_learned))
+        self._ask(loop.write_accelerations, points, out)
+        return out
+
+    def jacobian(self, state: Array) -> Array:
+        point = _given("a state", state, self._point_size)
+        out = np.empty((self.system.n_learned, self._size))
+        self._ask(loop.write_jacobian, point[None], out)
+        return out
+
+    def jacobian_change(self, state: Array, directions: Array) -> Array:
+        point = _given("a state", state, self._point_size)
+        along = _given("directions", directions, None, self._point_size)
+        out = np.empty((len(along), self.system.n_learned, self._size))
+        self._ask(loop.write_jacobian_change, point, along, out)
+        return out
+
+    @property
+    def covariance(self) -> Array:
+        if not self._covariance.size:
+            raise SpecificationError(
+                "a plan asked for the covariance of the parameters, but the trial holds no matrix "
+                "M of all of them: derive the policy from InformationPolicy with the form 'primal'."
+            )
+        return dense(self._covariance) * self._row_scale**2
+
+    def following(self, state: Array, inputs: Array) -> Array:
+        x = _given("a state", state, self.system.n_states)
+        u = _given("inputs", inputs, None, self.system.n_inputs)
+        out = np.empty((len(u), self.system.n_states))
+        self._ask(loop.write_following, x, u, out)
+        return out
+
+    def input_matrix(self, state: Array) -> Array:
+        x = _given("a state", state, self.system.n_states)
+        out = np.empty((self.system.n_inputs, self.system.n_states))
+        self._ask(loop.write_input_matrix, x, out)
+        return out.T
+
+
+def _given(what: str, values: Array, *shape: int | None) -> Array:
+    """Return an array of a shape, contiguous: compiled code reads it without a check.
+
+    Raises
+    ------
+    SpecificationError
+        If it has another shape; None stands for any size.
+    """
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    sizes = zip(array.shape, shape, strict=False)
+    if array.ndim != len(shape) or any(expected not in (None, size) for size, expected in sizes):
+        expected = ", ".join("N" if size is None else str(size) for size in shape)
+        raise SpecificationError(
+            f"a plan or an update asked the model about {what} of shape {array.shape}, but "
+            f"({expected}{',' if len(shape) == 1 else ''}) is expected: correct it."
+        )
+    return array
+
+
+def _fixed(values: Array) -> Array:
+    """Return a view that cannot be written into: what was observed stays."""
+    view = values[:]
+    view.flags.writeable = False
+    return view
+
+
+class KernelSteps(KernelState):
+    """The compiled steps of a trial: the caller says what state a plant has and what follows.
+
+    The states and the inputs of the record are theirs to write.
+    """
+
+    also_called: ClassVar[tuple[CompiledFunction, ...]] = ()
+
+    def __init__(self, spec: TrialSpec) -> None:
+        super().__init__(spec)
+        if spec.system.n_measured:
+            self.trial.sensors.start_variances[:] = start_variances(spec.system)
+        in_numpy = NumpyParts.needed_by(spec.config)
+        others = (*self.also_called, *(BETWEEN if in_numpy else ()))
+        self._code = compiled_steps(spec.policy, spec.learner, self.trial, others)
+        self._held = self._code.hold(self.trial, self._code.steps)
+        self._parts: NumpyParts | None = None
+        self._reached: CompiledFunction | None = None
+        if in_numpy:
+            self._parts = NumpyParts(spec, self.trial, self._held)
+            self._observe = compiled_step(self.trial, observe_next)
+            self._learn = compiled_step(self.trial, learn_next)
+
+    @property
+    def states(self) -> Array:
+        """States x_0 ... x_T, known or estimated, (T + 1, d)."""
+        return self.record.states
+
+    @property
+    def inputs(self) -> Array:
+        """Inputs u_0 ... u_{T-1}, (T, m)."""
+        return self.record.inputs
+
+    @property
+    def errors(self) -> Array:
+        """Errors of the accelerations before they were learned, (T,)."""
+        return self.record.loss
+
+    def begin(self, t: int, state: Array) -> None:
+        """Let step t begin at a state, (d,), whatever came before it."""
+        self.record.states[t] = state
+        if len(self.state.estimate.starts):
+            self.state.estimate.starts[t] = state
+
+    def replace(self, parameters: Array, constants: Array) -> None:
+        """Take other parameters of the model, (q,), and other constants of the system."""
+        self.state.theta[:] = parameters
+        self.trial.plant.parameters[:] = constants
+
+    def measure(self, t: int, measured: Array) -> None:
+        """Write what was measured after step t: x_{t+1}, (d,), or the outputs, (n,)."""
+        known = not self.spec.system.n_measured
+        into = self.record.states[t + 1] if known else self.state.estimate.outputs[t]
+        into[:] = measured
+
+    def reached(self, t: int, inputs: Array, seconds: Array) -> Array:
+        """Return the state, (d,), predicted from x_t after inputs (n, m) held for times (n,)."""
+        if self._reached is None:
+            self._reached = compiled_step(self.trial, loop.write_reached)
+        state: Array = np.empty(self.spec.system.n_states)
+        self._reached(self._held, self.record.states[t], inputs, seconds, state)
+        return state
+
+    def note_asked(self, u: Array) -> None:
+        """Let the limits of rates count from an input, (m,), and not from what acted."""
+        if len(self.state.prediction.last_input):
+            self.state.prediction.last_input[:] = u
+
+    def plan_input(self, t: int) -> None:
+        """Write the input u_t that the policy chooses at x_t."""
+        chosen_in = self._parts.choose(t, self.record.inputs[t]) if self._parts else 0.0
+        self._code.plan_input(self._held, t)
+        self.record.plan_us[t] += chosen_in
+
+    def take_in(self, t: int, dt: float) -> bool:
+        """Learn from x_t, u_t and x_{t+1}, which came dt seconds later.
+
+        Returns whether the parameters are finite.
+        """
+        if self._parts is None:
+            return bool(self._code.take_in(self._held, t, dt))
+        target = self._parts.targets[t]
+        self._observe(self._held, t, dt, target)
+        updated_in = self._parts.update(t)
+        finite = bool(self._learn(self._held, t, target))
+        self.record.learn_us[t] += updated_in
+        if finite:
+            self.record.plan_us[t] += self._parts.note(t)
+        return finite
+
+
+def is_stepped(config: TrialConfig) -> bool:
+    """Return whether the interpreter takes the steps of a trial one by one."""
+    return isinstance(config.system, BlackBox) or NumpyParts.needed_by(config)
+
+
+class SteppedTrial(KernelSteps):
+    """A trial in steps, with the attributes of :class:`dopt.kernel.run.KernelTrial`."""
+
+    also_called = (evaluate_next,)
+
+    def __init__(self, spec: TrialSpec) -> None:
+        super().__init__(spec)
+        shared = shared_points(spec.config)
+        self.points = points_of_trial(shared, self.trial.network)
+        self.done = 0
+        self.diverged_at: int | None = None
+        self._evaluate = compiled_evaluation(self.trial, self.points)
+        self._episode = None
+        if isinstance(spec.system, BlackBox):
+            self._episode = spec.system.episode(episode_seed(spec.seed))
+            self.begin(0, self._episode.state)
+        else:
+            self._act = compiled_step(self.trial, act_next)
+
+    @property
+    def feedback(self) -> Feedback | None:
+        """The law of feedback that the policy has learned; None where it learns none."""
+        return self._parts.feedback if self._parts else None
+
+    def advance(self, last: int) -> None:
+        """Run the steps up to ``last``, unless they are done or the trial has diverged."""
+        while self.done < last and self.diverged_at is None:
+            if self._step(self.done):
+                self.done += 1
+            else:
+                self.diverged_at = self.done
+
+    def _step(self, t: int) -> bool:
+        """Take step t, and return whether the trial goes on."""
+        self.plan_input(t)
+        if isinstance(self.spec.policy, CompiledPolicy):
+            check_norms(self.spec.policy.name, self.inputs[t : t + 1], t, self.spec.system.gamma)
+        inside, dt = self._go_on(t), self.spec.system.dt
+        goes_on = inside and self.take_in(t, dt) and self._evaluate(self._held, self.points, t)
+        if goes_on and self.evidence and t + 1 == self.evidence.due:
+            self.record.learn_us[t] += self.evidence.fit(self.points)
+        return goes_on
+
+    def _go_on(self, t: int) -> bool:
+        """Let the system go on to x_{t+1}, and return whether that is within its limit."""
+        if self._episode is None:
+            return bool(self._act(self._held, t))
+        self.inputs[t] = self._episode.step(self.inputs[t].copy())
+        if (start := new_start(self._episode)) is not None:
+            self.begin(t, start)
+        following = self.record.states[t + 1]
+        following[:] = self._episode.state
+        return bool(np.all(np.abs(following) <= self.spec.system.state_limit))  # false for NaN
+
 
 FIRST_STEPS = 300
 """Steps of a trial before it is known what a step costs; trials of the paper have no more."""
@@ -134,3 +499,43 @@ def _advance_in_pieces(trial: KernelTrial | SteppedTrial, last: int) -> None:
         trial.advance(min(last, before + steps))
         rate = (trial.done - before) / (time.perf_counter() - start)
         steps = max(1, int(rate * PIECE_SECONDS))
+
+
+def true_forecast(system: System) -> Forecast:
+    """Return the forecast of the system itself, as it is at the first step."""
+    return _by_equations(system, system.history[0])
+
+
+def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
+    """Return the forecast of a model of the kernel with parameters (q,)."""
+    if isinstance(model, MLP):
+        thetas = np.reshape(parameters, (model.n_members, -1)).copy()
+        given = (network_of(system, model), thetas)
+        return _forecast("follow-network", follow_network, system, given)
+    # The accelerations are affine in θ, so that the linear model is the system with θ for its own.
+    offset, *units = np.array(system.linear_form)
+    return _by_equations(system, offset + parameters @ (np.array(units) - offset))
+
+
+def _by_equations(system: System, parameters: Array) -> Forecast:
+    return _forecast("follow-equations", follow_equations, system, (np.array(parameters),))
+
+
+def _forecast(
+    name: str, function: Callable[..., None], system: System, given: tuple[object, ...]
+) -> Forecast:
+    plant = plant_of(system)
+    kind = kind_of(plant)
+    held = compiled_for("hold-plant", hold_plant, (kind,))(plant)
+    kinds = (HeldPlantType([("plant", kind)]), *map(kind_of, given), *[float64[:, :, ::1]] * 2)
+    follow = compiled_for(name, function, kinds)
+
+    def forecast(states: Array, inputs: Array) -> Array:
+        n, steps, _ = inputs.shape
+        visited = np.empty((steps + 1, n, states.shape[1]))
+        visited[0] = states
+        by_step = np.ascontiguousarray(inputs.swapaxes(0, 1))
+        follow(held, *given, by_step, visited)
+        return visited[1:]
+
+    return forecast

@@ -190,7 +190,7 @@ class Plant(NamedTuple):
 
 
 class Waves(NamedTuple):
-    """Random features (:mod:`dopt.kernel.model_kinds`); empty in other models."""
+    """Random features (:mod:`dopt.kernel.model`); empty in other models."""
 
     frequencies: Matrix  # (D, p), Ω
     phases: Vector  # (D,), b

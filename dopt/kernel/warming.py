@@ -48,8 +48,7 @@ from dopt.kernel.pointers import (
     path_of,
     step_kinds,
 )
-from dopt.kernel.run import KernelTrial
-from dopt.kernel.steps import NumpyParts, is_stepped
+from dopt.kernel.run import KernelTrial, NumpyParts, is_stepped
 from dopt.kernel.structs import Information
 from dopt.learning import LEARNERS, Adam, RecursiveLeastSquares
 from dopt.policies import POLICIES, DOptimal, Periodic, Uniform

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dopt.learning.adam import Adam, AdamReplay, AdamRule, AdamWindow
 from dopt.learning.base import InformationLearner, Learner
-from dopt.learning.least_squares import (
+from dopt.learning.online import (
+    Adam,
+    AdamReplay,
+    AdamRule,
+    AdamWindow,
     Conditioning,
     ExtendedKalman,
     GaussNewton,

@@ -12,7 +12,6 @@ from dopt.policies.d_optimal import (
     Uniform,
 )
 from dopt.policies.held_candidates import Disagreement, GaussianProcessEntropy, SpaceFilling
-from dopt.policies.icem import ICEM, Episodic
 from dopt.policies.open_loop import (
     PRBS,
     Chirp,
@@ -23,7 +22,17 @@ from dopt.policies.open_loop import (
     RandomHeld,
     RandomSphere,
 )
-from dopt.policies.search import AOptimal, EOptimal, Exact, Lookahead, Search, TaskOptimal, Trace
+from dopt.policies.search import (
+    ICEM,
+    AOptimal,
+    EOptimal,
+    Episodic,
+    Exact,
+    Lookahead,
+    Search,
+    TaskOptimal,
+    Trace,
+)
 
 TITLES: dict[str, str] = {
     "d_optimal": "D-optimal",

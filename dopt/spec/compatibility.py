@@ -40,15 +40,7 @@ from dopt.models import (
     LinearState,
     Model,
 )
-from dopt.policies import (
-    ICEM,
-    DOptimal,
-    InformationPolicy,
-    Oracle,
-    Policy,
-    Search,
-    Uniform,
-)
+from dopt.policies import ICEM, DOptimal, InformationPolicy, Oracle, Policy, Search, Uniform
 from dopt.policies.base import CustomPolicy, OpenLoop
 from dopt.policies.d_optimal import GreedyLinear
 from dopt.policies.held_candidates import Disagreement, GaussianProcessEntropy

@@ -2,8 +2,8 @@
 
 What an explorer is told, answers and stores is in the units that the plant declares. Its steps work
 with states that are divided by their sizes and inputs that are divided by γ
-(:mod:`dopt.systems.scales`), so that learners, priors, differences and plans see these alone; here
-one is turned into the other.
+(:mod:`dopt.systems.properties`), so that learners, priors, differences and plans see these alone;
+here one is turned into the other.
 
 Systems with equations, and explorations that were begun before there were scales, work with the
 numbers they are given.
@@ -27,7 +27,7 @@ from dopt.policies import POLICIES, Policy, TaskOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import ExploredPlant
-from dopt.systems.scales import SPLIT, rounded
+from dopt.systems.properties import SPLIT, rounded
 from dopt.types import Array
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.systems import elementary
-from dopt.systems.scales import SPLIT
+from dopt.systems.properties import SPLIT
 from dopt.types import Equation
 
 FUNCTIONS = {
@@ -66,7 +66,7 @@ def compiled_text(
         What the arguments of some quantities are multiplied by.
     results : sequence of float, optional
         What the value of each expression is divided by, before it is rounded to 36 bits
-        (:mod:`dopt.systems.scales`).
+        (:mod:`dopt.systems.properties`).
 
     Raises
     ------

@@ -15,9 +15,8 @@ from dopt.fields import unvalidated
 from dopt.systems.base import Feature
 from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.systems.expressions import check_names, compiled_text
-from dopt.systems.properties import input_effect
+from dopt.systems.properties import input_effect, rounded, scales, sizes
 from dopt.systems.real import LONGEST_DELAY, Flight
-from dopt.systems.scales import rounded, scales, sizes
 from dopt.types import Array
 
 NAME = "plant"
@@ -439,7 +438,7 @@ class Plant:
 
     @functools.cached_property
     def scales(self) -> tuple[float, ...]:
-        """What each state is divided by in scaled numbers (:mod:`dopt.systems.scales`)."""
+        """What each state is divided by in scaled numbers (:mod:`dopt.systems.properties`)."""
         return scales(self.system(1), self._sizes)
 
     @functools.cached_property

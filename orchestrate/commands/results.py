@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dopt.limits import VIOLATIONS, WORST
-from dopt.spec.config import completed, limits_label
+from dopt.spec.config import completed
 from orchestrate.commands.command import (
     Command,
     add_filters,
@@ -223,34 +223,6 @@ def _public(value: Any) -> Any:
     return [without_password(word) for word in value] if isinstance(value, list) else value
 
 
-COLUMNS = (
-    *("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma", "task"),
-    "limits",
-)
-
-
-def column_text(config: ConfigRow, name: str) -> str:
-    """Return the value of a column; "-" where the configuration has none."""
-    if name == "limits":
-        return limits_label(config.config) or "-"
-    value = _task(config) if name == "task" else getattr(config, name)
-    return "-" if value is None else str(value)
-
-
-def differing(configs: Sequence[ConfigRow], always: Sequence[str] = ()) -> list[str]:
-    """Return the columns that ``always`` names or that have several values, in their order."""
-    return [
-        name
-        for name in COLUMNS
-        if name in always or len({column_text(config, name) for config in configs}) > 1
-    ]
-
-
-def _task(config: ConfigRow) -> object:
-    task = config.config.get("task")
-    return task.get("name") if isinstance(task, Mapping) else task
-
-
 DEFAULT_LIMIT = 1_000
 DEFAULT_TIMEOUT_SECONDS = 60.0
 _MAX_TEXT = 60  # characters of a value in a table
@@ -436,7 +408,6 @@ SHOW_COMMAND = Command(
 
 _MIN_DIGITS = 4
 _MAX_LISTED = 10
-_NAMES = ("env", "policy")
 _TRIALS = "SELECT trial_id, trial_key, config_key, width, seed, status FROM v_trial"
 
 
@@ -485,8 +456,7 @@ def the_one(trials: Sequence[ListedTrial], start: str | None) -> ListedTrial:
             f"There is no trial with {named}: take a key from "
             f'query "SELECT trial_key, env, policy, seed, status FROM v_trial".'
         )
-    columns = differing([trial.config for trial in trials], always=(*_NAMES, "width"))
-    some = "; ".join(describe(trial, columns) for trial in trials[:_MAX_LISTED])
+    some = "; ".join(map(describe, trials[:_MAX_LISTED]))
     rest = f" and {len(trials) - _MAX_LISTED:,} more" if len(trials) > _MAX_LISTED else ""
     raise UsageError(
         f"{len(trials):,} trials have {named}, one is expected: "
@@ -494,11 +464,9 @@ def the_one(trials: Sequence[ListedTrial], start: str | None) -> ListedTrial:
     )
 
 
-def describe(trial: ListedTrial, columns: Sequence[str] = COLUMNS) -> str:
-    """Return the first digits of the key, the columns that have a value, and the seed."""
-    texts = {name: column_text(trial.config, name) for name in columns}
-    words = [f"{name}={text}" for name, text in texts.items() if text != "-"]
-    return f"{trial.trial_key[:12]} ({' '.join(words)} seed={trial.seed})"
+def describe(trial: ListedTrial) -> str:
+    """Return the first digits of the key, the environment, the label and the seed."""
+    return f"{trial.trial_key[:12]} ({trial.config.env}, {trial.config.label}, seed {trial.seed})"
 
 
 def _check(start: str) -> None:
@@ -509,9 +477,9 @@ def _check(start: str) -> None:
         )
 
 
-NAMES = ("env", "policy", "width")
-DETAILS = tuple(name for name in COLUMNS if name not in NAMES)
-_TEXT_COLUMNS = ("env", "policy", "model", "learner", "task", "limits")
+ROWS = (("env", "label"), ("env", "policy"), ("env",))
+"""Columns that name a row of the grid, the longest table first."""
+
 _STYLES = {
     "failed": "red",
     "diverged": "yellow",
@@ -524,21 +492,24 @@ _STYLES = {
 def grid_table(configs: Sequence[ConfigRow], max_rows: int) -> Table:
     """Return a table of at most ``max_rows`` rows, or of one for each environment.
 
-    Beside ``NAMES`` there is a column for each other one that tells configurations apart. Where
-    that makes too many rows, columns go, from the last one on, and the configurations of a row
-    are counted together.
+    A row is a configuration by its label; where there are too many, all configurations of a policy
+    or of an environment are counted together.
     """
-    columns = _columns(configs, max_rows)
-    rows = _grouped(configs, columns)
+    for columns in ROWS:
+        rows: dict[tuple[str, ...], list[ConfigRow]] = {}
+        for config in configs:
+            rows.setdefault(tuple(getattr(config, name) for name in columns), []).append(config)
+        if len(rows) <= max_rows:
+            break
     merged = len(rows) < len(configs)
     total = counts(configs)
     states = [state for state in _STYLES if state != "cancelled" or total[state]]
     heads = [*columns, *(["configs"] if merged else []), "done", "of", *states]
     footers = ["total", *[""] * (len(columns) - 1), *_numbers(configs, states, merged)]
     styles = [_STYLES.get(head, "") for head in heads]
-    result = table(heads, numbers=set(heads) - {*_TEXT_COLUMNS}, styles=styles, footers=footers)
+    result = table(heads, numbers={*heads} - {*columns}, styles=styles, footers=footers)
     for names, group in rows.items():
-        result.add_row(*names, *_numbers(group, states, merged))
+        result.add_row(*map(plain, names), *_numbers(group, states, merged))
     return result
 
 
@@ -547,22 +518,3 @@ def _numbers(configs: Sequence[ConfigRow], states: Sequence[str], merged: bool) 
     words = [f"{number['done']:,}", f"{number.total():,}"]
     words += [f"{number[state]:,}" if number[state] else "-" for state in states]
     return [f"{len(configs):,}", *words] if merged else words
-
-
-def _columns(configs: Sequence[ConfigRow], max_rows: int) -> list[str]:
-    columns = list(NAMES)
-    for detail in DETAILS:
-        if len(_grouped(configs, [*columns, detail])) > len(_grouped(configs, columns)):
-            columns.append(detail)
-    while len(columns) > 1 and len(_grouped(configs, columns)) > max_rows:
-        columns.pop()
-    return columns
-
-
-def _grouped(
-    configs: Sequence[ConfigRow], columns: Sequence[str]
-) -> dict[tuple[str, ...], list[ConfigRow]]:
-    rows: dict[tuple[str, ...], list[ConfigRow]] = {}
-    for config in configs:
-        rows.setdefault(tuple(column_text(config, name) for name in columns), []).append(config)
-    return rows

@@ -290,7 +290,7 @@ def _add_work_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_work(arguments: argparse.Namespace) -> ExitCode:
     """Run trials until none is left, the time is over, or a signal comes."""
-    from orchestrate.runner.run_grid import Output
+    from orchestrate.runner.start import Output
     from orchestrate.runner.worker import WorkerSettings, run_worker
 
     Reader.open(arguments.db).close()  # a worker creates no database

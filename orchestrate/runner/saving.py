@@ -33,7 +33,6 @@ from orchestrate.store import (
     DatabaseMovedError,
     LaunchRecord,
     Registrable,
-    Result,
     Saved,
     Store,
     StoreError,
@@ -120,7 +119,7 @@ class RetryingStore:
 
         return self._persist(claim, again)
 
-    def commit(self, items: Sequence[tuple[Claim, Result, RunRecord]]) -> list[bool]:
+    def commit(self, items: Sequence[tuple[Claim, TrialResult, RunRecord]]) -> list[bool]:
         """Write finished trials; False for each whose claim is lost."""
         claims = [claim for claim, _, _ in items]
 

@@ -24,22 +24,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
-from orchestrate.runner.progress import (
-    SIGNALS,
-    Interrupt,
-    Progress,
-    Repetition,
-    Tally,
-    handling,
-)
-from orchestrate.runner.run_grid import (
-    WORK,
-    Output,
-    Work,
-    recorded_launch,
-    started,
-    worked,
-)
+from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally, handling
 from orchestrate.runner.saving import RetryingStore, launch_record
 from orchestrate.runner.scheduler import (
     BYTES_PER_GIB,
@@ -49,6 +34,7 @@ from orchestrate.runner.scheduler import (
     Scheduler,
     memory_of_this_machine,
 )
+from orchestrate.runner.start import WORK, Output, Work, recorded_launch, started, worked
 from orchestrate.store import OpenConfig
 
 WARNINGS = (*SIGNALS, signal.SIGUSR1)
@@ -144,7 +130,7 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
     Raises
     ------
     StoreError, InfrastructureError
-        As :func:`orchestrate.runner.run_grid.launch_grid`.
+        As :func:`orchestrate.runner.start.launch_grid`.
     """
     repeated = Repetition()
 

@@ -24,9 +24,8 @@ from orchestrate.errors import StoreError
 from orchestrate.store import records
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend, parse_url, public_url, sqlite_path
-from orchestrate.store.doctor import TrialKey
 from orchestrate.store.reader import Reader
-from orchestrate.store.records import DTYPE, Array, stored_json, unpack
+from orchestrate.store.records import DTYPE, Array, TrialKey, stored_json, unpack
 from orchestrate.store.results import insert_error, steps_ahead, unpacked
 from orchestrate.store.schema import (
     FINISHED,

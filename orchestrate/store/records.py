@@ -16,7 +16,7 @@ import json
 import math
 import zlib
 from collections import namedtuple
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -48,6 +48,9 @@ from orchestrate.store.schema import FINISHED, N_ROWS, STEP_VALUES, Outcome, cur
 
 Array = npt.NDArray[np.float64]
 
+TrialKey = Callable[[str, int], str]
+"""Function from the JSON of a configuration and a seed to the key of the trial."""
+
 
 class Registrable(Protocol):
     """Trial before it runs, such as :class:`dopt.spec.trial.TrialSpec`."""
@@ -62,48 +65,6 @@ class Registrable(Protocol):
     def seed(self) -> int: ...
     def columns(self) -> Mapping[str, Any]:
         """Values of env, policy, model, learner, width, depth, horizon, dt, gamma and label."""
-
-
-class Measured(Protocol):
-    """Measure of a trial after t steps."""
-
-    @property
-    def t(self) -> int: ...
-    @property
-    def measure(self) -> str: ...
-    @property
-    def value(self) -> float: ...
-
-
-class Result(Protocol):
-    """Result of a trial; :class:`dopt.result.TrialResult` describes the fields."""
-
-    @property
-    def loss(self) -> Array: ...
-    @property
-    def reachable_loss(self) -> Array: ...
-    @property
-    def plan_us(self) -> Array: ...
-    @property
-    def learn_us(self) -> Array: ...
-    @property
-    def evaluate_us(self) -> Array: ...
-    @property
-    def states(self) -> Array: ...
-    @property
-    def inputs(self) -> Array: ...
-    @property
-    def parameters(self) -> Array: ...
-    @property
-    def diverged_at(self) -> int | None: ...
-    @property
-    def n_steps(self) -> int: ...
-    @property
-    def final_loss(self) -> float | None: ...
-    @property
-    def best_loss(self) -> float | None: ...
-    @property
-    def assessments(self) -> Sequence[Measured]: ...
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sqlalchemy import (
@@ -31,9 +31,7 @@ from orchestrate.store.records import (
     DTYPE,
     Array,
     Claim,
-    Measured,
     Registrable,
-    Result,
     finite,
     not_before,
     pack,
@@ -59,8 +57,11 @@ from orchestrate.store.schema import (
     trial,
 )
 
+if TYPE_CHECKING:
+    from dopt.result import Assessment, TrialResult
 
-def check_result(trial_key: str, result: Result) -> None:
+
+def check_result(trial_key: str, result: TrialResult) -> None:
     """Raise ``InvalidResultError`` if the arrays of a result are inconsistent."""
     n = len(result.loss)
     for name in STEP_VALUES:
@@ -73,7 +74,7 @@ def check_result(trial_key: str, result: Result) -> None:
 
 
 def _expect_shape(
-    trial_key: str, result: Result, name: str, expected: tuple[int | None, ...]
+    trial_key: str, result: TrialResult, name: str, expected: tuple[int | None, ...]
 ) -> None:
     shape = np.shape(getattr(result, name))
     fits = len(shape) == len(expected) and all(
@@ -85,7 +86,7 @@ def _expect_shape(
         )
 
 
-def _check_divergence(trial_key: str, result: Result) -> None:
+def _check_divergence(trial_key: str, result: TrialResult) -> None:
     loss = np.isfinite(np.asarray(result.loss, dtype=np.float64))
     at = result.diverged_at
     if at is None and not loss.all():
@@ -99,7 +100,7 @@ def _check_divergence(trial_key: str, result: Result) -> None:
         raise _refusal(trial_key, f"there are losses after the divergence at step {at}")
 
 
-def _check_assessments(trial_key: str, result: Result) -> None:
+def _check_assessments(trial_key: str, result: TrialResult) -> None:
     seen: set[tuple[int, str]] = set()
     for row in result.assessments:
         if not 0 <= row.t <= result.n_steps:
@@ -190,7 +191,7 @@ class PreparedRows:
     assessments: list[dict[str, Any]]
 
 
-def prepare(claim: Claim, result: Result, run: RunRecord) -> PreparedRows:
+def prepare(claim: Claim, result: TrialResult, run: RunRecord) -> PreparedRows:
     """Check a result and return its rows; raise ``InvalidResultError`` if it is invalid."""
     check_result(claim.trial_key, result)
     steps = np.column_stack([getattr(result, name) for name in STEP_VALUES]).astype(np.float64)
@@ -207,18 +208,18 @@ def prepare(claim: Claim, result: Result, run: RunRecord) -> PreparedRows:
     )
 
 
-def _trajectory_row(claim: Claim, result: Result) -> dict[str, Any]:
+def _trajectory_row(claim: Claim, result: TrialResult) -> dict[str, Any]:
     row: dict[str, Any] = {"trial_id": claim.trial_id, "dtype": DTYPE}
     for name in ("states", "inputs", "parameters"):
         row[f"{name}_shape"], row[name] = pack(getattr(result, name))
     return row
 
 
-def _assessment_rows(claim: Claim, result: Result) -> list[dict[str, Any]]:
+def _assessment_rows(claim: Claim, result: TrialResult) -> list[dict[str, Any]]:
     return [_assessment_row(claim.trial_id, row) for row in result.assessments]
 
 
-def _assessment_row(trial_id: int, row: Measured) -> dict[str, Any]:
+def _assessment_row(trial_id: int, row: Assessment) -> dict[str, Any]:
     value = finite(row.value)
     return {"trial_id": trial_id, "t": int(row.t), "measure": row.measure, "value": value}
 
@@ -232,7 +233,7 @@ def _run_row(run: RunRecord) -> dict[str, Any]:
     }
 
 
-def _values(source: Result | RunRecord, names: Sequence[str]) -> dict[str, Any]:
+def _values(source: TrialResult | RunRecord, names: Sequence[str]) -> dict[str, Any]:
     """Return attributes as the database stores them: None for a number that is not finite."""
     found = {name: plain(getattr(source, name)) for name in names}
     return {name: finite(one) if isinstance(one, float) else one for name, one in found.items()}
@@ -308,7 +309,7 @@ def insert_error(connection: Connection, row: Mapping[str, Any]) -> int:
 
 
 def add_assessments(
-    connection: Connection, backend: Backend, measured: Mapping[str, Measured]
+    connection: Connection, backend: Backend, measured: Mapping[str, Assessment]
 ) -> int:
     """Write a measure of trials that are done, by trial key, in place of its value; count them."""
     keys = backend.members(list(measured))
@@ -400,7 +401,7 @@ def save(
     backend: Backend,
     launch_id: int,
     spec: Registrable,
-    result: Result,
+    result: TrialResult,
     run: RunRecord,
     last: Saved | None,
 ) -> Saved | None:
@@ -428,7 +429,9 @@ def save(
     return Saved(last.claim, len(result.loss))
 
 
-def is_longer(connection: Connection, backend: Backend, spec: Registrable, result: Result) -> bool:
+def is_longer(
+    connection: Connection, backend: Backend, spec: Registrable, result: TrialResult
+) -> bool:
     """Return True if the stored exploration has more steps; a fit is always written again whole.
 
     Raises ``StoreError`` if it holds another exploration of the same key.
@@ -464,7 +467,7 @@ def _is_mine(connection: Connection, last: Saved) -> bool:
 
 
 def _take(
-    connection: Connection, backend: Backend, launch_id: int, spec: Registrable, result: Result
+    connection: Connection, backend: Backend, launch_id: int, spec: Registrable, result: TrialResult
 ) -> Saved | None:
     """Begin an attempt at the trial, without steps; return None if more of it is stored."""
     register(connection, backend, launch_id, GridRows([spec]))

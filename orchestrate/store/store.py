@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from sqlalchemy import URL
 
@@ -13,15 +13,11 @@ from orchestrate.store.backends.base import Backend, parse_url
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
 from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
-from orchestrate.store.records import (
-    Claim,
-    LaunchRecord,
-    Measured,
-    Registrable,
-    Registration,
-    Result,
-)
+from orchestrate.store.records import Claim, LaunchRecord, Registrable, Registration
 from orchestrate.store.results import Saved
+
+if TYPE_CHECKING:
+    from dopt.result import Assessment, TrialResult
 
 LEASE_SECONDS = 60.0
 PATIENCE_SECONDS = 30.0
@@ -159,14 +155,14 @@ class Store:
             launches.renew(connection, self._backend, launch)
             return launches.claim(connection, self._backend, launch, trial_keys, alike)
 
-    def commit(self, claim: Claim, result: Result, run: RunRecord) -> bool:
+    def commit(self, claim: Claim, result: TrialResult, run: RunRecord) -> bool:
         """Write a finished trial with its curve and trajectory; return False if the claim is lost.
 
         Raises ``InvalidResultError``, and writes nothing, for an invalid result.
         """
         return self.commit_many([(claim, result, run)])[0]
 
-    def commit_many(self, items: Sequence[tuple[Claim, Result, RunRecord]]) -> list[bool]:
+    def commit_many(self, items: Sequence[tuple[Claim, TrialResult, RunRecord]]) -> list[bool]:
         """Write finished trials in one transaction; return False for each lost claim.
 
         Raises ``InvalidResultError``, and writes nothing, if one result is invalid.
@@ -180,7 +176,7 @@ class Store:
                 written[i] = results.write(connection, self._backend, prepared[i])
         return written
 
-    def holds_more(self, spec: Registrable, result: Result) -> bool:
+    def holds_more(self, spec: Registrable, result: TrialResult) -> bool:
         """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
         with self._backend.transaction() as connection:
             return results.is_longer(connection, self._backend, spec, result)
@@ -189,7 +185,7 @@ class Store:
         self,
         launch: int,
         spec: Registrable,
-        result: Result,
+        result: TrialResult,
         run: RunRecord,
         last: Saved | None = None,
     ) -> Saved | None:
@@ -208,7 +204,7 @@ class Store:
         with self._backend.transaction() as connection:
             return results.write_failure(connection, claim, failure, run)
 
-    def add_assessments(self, measured: Mapping[str, Measured]) -> int:
+    def add_assessments(self, measured: Mapping[str, Assessment]) -> int:
         """Write a measure of trials that are done, by trial key, and return their number.
 
         It takes the place of a stored value of the same step. Other trials are left as they are.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dopt.kernel.learners.joint_kalman import run_filter
+from dopt.kernel.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.offline_fit import HALF_WIDTH, Samples, fit_offline, jacobian
 from dopt.spec.trial import TrialSpec

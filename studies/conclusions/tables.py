@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.stats.intervals import Estimate, geometric_mean
+from analysis.stats.curves import Estimate, geometric_mean
 from analysis.style import number, share, within
 from studies.conclusions.filter import PARTS
 from studies.conclusions.network import FORMS

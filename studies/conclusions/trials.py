@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from analysis.stats.curves import periodogram
+from dopt.evaluation import box_states
 from dopt.offline_fit import sample_loss
-from dopt.policies.task_states import box_states
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System

@@ -24,7 +24,7 @@ import pandas as pd
 
 from analysis.data.matching import AnalysisError, latest
 from analysis.data.selection import Entry
-from analysis.stats.intervals import CONFIDENCE
+from analysis.stats.curves import CONFIDENCE
 from analysis.style import within
 from analysis.tables.comparisons import against_reference
 from orchestrate.store import ConfigRow, Reader

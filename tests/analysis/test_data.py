@@ -23,8 +23,7 @@ from analysis.figures.phase_portraits import (
     tabulate_portraits,
     tabulate_spectra,
 )
-from analysis.stats.curves import PlotOptions, measure_curves, tabulate_curves
-from analysis.stats.intervals import Statistic
+from analysis.stats.curves import PlotOptions, Statistic, measure_curves, tabulate_curves
 from analysis.tables.comparisons import compare_policies
 from analysis.tables.rendering import TABLES
 from dopt.errors import SpecificationError

@@ -143,7 +143,7 @@ def test_a_point_is_a_configuration_of_an_environment_that_has_several(learners:
     assert len(labels) == len(set(labels)) == 10  # neither the task nor the other bound
     assert {point.env for point in points} == set(ENVS)
     assert "random, gauss_newton, refit_every=10" in labels
-    words = {(one.policy_words, one.learner_words) for one in points if one.env == "pendulum"}
+    words = {(one.policy_label, one.learner_label) for one in points if one.env == "pendulum"}
     assert len(words) == 10
     assert {("random", "gauss_newton"), ("random", "gauss_newton, ensemble")} <= words
     assert list(policies_of(points)) == ["D-optimal", "D-optimal, information=fresh", "random"]
@@ -151,9 +151,9 @@ def test_a_point_is_a_configuration_of_an_environment_that_has_several(learners:
 
 def test_time_counts_the_fits_of_some_steps_and_loss_is_a_geometric_mean(learners: str) -> None:
     found = {(one.env, one.label): one for one in points_of(learners)}
-    assert found["pendulum", "random, gauss_newton"].us == pytest.approx(105.0)
+    assert found["pendulum", "random, gauss_newton"].us_per_step == pytest.approx(105.0)
     every_tenth = found["pendulum", "random, gauss_newton, refit_every=10"]
-    assert every_tenth.us == pytest.approx(5.0 + (100.0 + 9 * 1.0) / 10)
+    assert every_tenth.us_per_step == pytest.approx(5.0 + (100.0 + 9 * 1.0) / 10)
     with Reader.open(learners) as reader:
         [config] = [
             one
@@ -162,13 +162,13 @@ def test_time_counts_the_fits_of_some_steps_and_loss_is_a_geometric_mean(learner
             and one.config["learner"].get("refit_every") == 10
         ]
         finals = [trial.final_loss for trial in reader.trials(config.config_key)]
-    assert every_tenth.loss.value == pytest.approx(np.exp(np.mean(np.log(finals))))
-    assert every_tenth.loss.low < every_tenth.loss.value < every_tenth.loss.high
+    assert every_tenth.loss == pytest.approx(np.exp(np.mean(np.log(finals))))
+    assert every_tenth.low < every_tenth.loss < every_tenth.high
 
 
 def test_each_environment_has_its_front(learners: str) -> None:
     points = [one for one in points_of(learners) if one.env == "pendulum"]
-    front = on_front(np.array([(one.us, one.loss.value) for one in points]))
+    front = on_front(np.array([(one.us_per_step, one.loss) for one in points]))
     assert [one.on_front for one in points] == front.tolist()
     assert 0 < front.sum() < len(points)
 

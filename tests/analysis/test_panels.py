@@ -28,8 +28,7 @@ from analysis.figures.panels import (
     styled,
 )
 from analysis.figures.phase_portraits import GREYS, measure_portraits, tabulate_portraits
-from analysis.stats.curves import axis_parts, band_limits, log_limits, median_seed
-from analysis.stats.intervals import Band
+from analysis.stats.curves import Band, axis_parts, band_limits, log_limits, median_seed
 from analysis.style import SEQUENCE, policy_style, sequence_style
 from dopt.assessment import Plane
 from dopt.policies import POLICIES

@@ -33,17 +33,17 @@ from analysis.stats.curves import (
     wrapped_line,
 )
 from analysis.stats.scores import (
-    ControlCurve,
     Measure,
     control_part,
-    measure_control,
     relative_costs,
     scores_at,
+    task_of,
     true_model,
 )
 from analysis.style import count_text, number, p_text, plus_minus, unit_of
 from analysis.tables.comparisons import compare_control, compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table
+from analysis.tables.variants import TRUTH, VariantGroup, tabulate_control_of
 from dopt.assessment import TURN, turns, wrap
 from dopt.offline_fit import held_out_fit
 from dopt.result import Assessment, TrialResult
@@ -267,8 +267,13 @@ def part(reader: Reader) -> Selection:
     return control_part(select(reader, Filter()))
 
 
-def curve_of(curves: tuple[ControlCurve, ...], env: str, policy: str) -> ControlCurve:
-    return next(one for one in curves if (one.env, one.policy) == (env, policy))
+def control_of(reader: Reader, part: Selection, env: str) -> pd.DataFrame:
+    """Return the rows of the table of control of an environment, by policy."""
+    group = VariantGroup(env, part.of(env), task=task_of(part.of(env)[0]))
+    table = tabulate_control_of(reader, [group])
+    assert table is not None
+    names = {one.label: one.config.policy for one in group.variants}
+    return table.assign(policy=table["variant"].map(names)).set_index("policy")
 
 
 def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> None:
@@ -280,25 +285,24 @@ def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> N
 
 
 def test_the_numbers_follow_from_the_trials(reader: Reader, part: Selection) -> None:
-    curves = measure_control(reader, part)
-    curve = curve_of(curves, "pendulum", "uniform")
+    curve = control_of(reader, part, "pendulum").loc["uniform"].set_index("t")
     entry = next(e for e in part.of("pendulum") if e.config.policy == "uniform")
     task = entry.config.config["task"]
     specs = make_grid(("pendulum",), ("uniform",), range(5), **SHORT, task=task)
     rows = [fake_result(spec).assessments for spec in specs]
-    assert curve.t.tolist() == [0, 20, 40, 60]
-    assert curve.n.tolist() == [5] * 4
-    for j, t in enumerate(curve.t):
+    assert curve.index.tolist() == [0, 20, 40, 60]
+    assert curve["n"].tolist() == [5] * 4
+    for t, row in curve.iterrows():
         costs = [_value(of, t, "control_cost") / 100.0 for of in rows]
-        assert curve.cost[j] == pytest.approx(np.exp(np.mean(np.log(costs))))
-        assert curve.cost_low[j] < curve.cost[j] < curve.cost_high[j]
-        assert curve.success[j] == np.mean([_value(of, t, "control_success") for of in rows])
+        assert row["cost"] == pytest.approx(np.exp(np.mean(np.log(costs))))
+        assert row["cost_low"] < row["cost"] < row["cost_high"]
+        assert row["success"] == np.mean([_value(of, t, "control_success") for of in rows])
 
 
 @pytest.mark.parametrize(
     "measure",
     [
-        lambda reader, part: measure_control(reader, part)[0].cost,
+        lambda reader, part: control_of(reader, part, "pendulum")["cost"].to_numpy(),
         lambda reader, part: relative_costs(reader, part.entries[0]).values,
         lambda reader, part: list(scores_at(reader, part.entries[0], 20).by_seed.items()),
         lambda reader, part: dataclasses.astuple(true_model(reader, part.entries)),
@@ -334,13 +338,13 @@ def _value(rows: tuple[Assessment, ...], t: int, measure: str) -> float:
 
 
 def test_wilson_intervals_equal_the_textbook(reader: Reader, part: Selection) -> None:
-    curve = curve_of(measure_control(reader, part), "pendulum", "d_optimal")
-    first, last = 0, -1
-    assert (curve.success[first], curve.success[last]) == (0.0, 1.0)
+    curve = control_of(reader, part, "pendulum").loc["d_optimal"]
+    first, last = (curve.iloc[place] for place in (0, -1))
+    assert (first["success"], last["success"]) == (0.0, 1.0)
     z = 1.959963985
     edge = z**2 / (5 + z**2)  # no success in five
-    assert (curve.success_low[first], curve.success_high[first]) == pytest.approx((0, edge))
-    assert (curve.success_low[last], curve.success_high[last]) == pytest.approx((1 - edge, 1))
+    assert (first["success_low"], first["success_high"]) == pytest.approx((0, edge))
+    assert (last["success_low"], last["success_high"]) == pytest.approx((1 - edge, 1))
 
 
 def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
@@ -369,7 +373,7 @@ def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
         assert costs.values.shape == (3, 3)
         assert scores_at(reader, entry, 19).by_seed == {}
         assert sorted(scores_at(reader, entry, 20).by_seed) == [0, 1, 2]
-        assert [one.n.tolist() for one in measure_control(reader, part)] == [[3, 3, 3]]
+        assert control_of(reader, part, "pendulum").loc["random", "n"].tolist() == [3, 3, 3]
 
 
 def valued(
@@ -398,18 +402,17 @@ def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **TASK)
     with filled(tmp_path, specs, edit=overflown("control_cost", ("random",), (1, 3), 20)) as reader:
         part = control_part(select(reader, Filter()))
-        curves = measure_control(reader, part)
+        curves = control_of(reader, part, "pendulum")
         entry = next(entry for entry in part.entries if entry.config.policy == "random")
         scores = scores_at(reader, entry, 20).by_seed
         table = compare_control(reader, part)
-    curve = curve_of(curves, "pendulum", "random")
-    assert curve.n.tolist() == [5, 5, 5]
-    assert curve.lost.tolist() == [0, 2, 0]
+    curve = curves.loc["random"]
+    assert curve["n"].tolist() == [5, 5, 5]
+    assert curve["lost"].tolist() == [0, 2, 0]
     assert {seed for seed, score in scores.items() if np.isinf(score)} == {1, 3}
     finite = [score for score in scores.values() if np.isfinite(score)]
-    assert curve.cost[1] == pytest.approx(np.exp(np.mean(np.log(finite))))
-    assert [one.lost.tolist() for one in curves] == [[0, 0, 0], [0, 2, 0]]
-    assert curve.counts == "5, 2 lost"
+    assert curve["cost"].iloc[1] == pytest.approx(np.exp(np.mean(np.log(finite))))
+    assert curves.loc["d_optimal", "lost"].tolist() == [0, 0, 0]
     row = table[table.t == 20].iloc[0]
     assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 0.0)
     assert row.p_value == pytest.approx(2 / 2**5)  # all five, the lost ones too
@@ -426,11 +429,11 @@ def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> 
         edit=overflown("true_model_cost", ("d_optimal", "random"), tuple(range(5)), 0),
     ) as reader:
         part = control_part(select(reader, Filter()))
-        curves = measure_control(reader, part)
+        curves = control_of(reader, part, "pendulum").loc[["d_optimal", "random"]]
         table = compare_control(reader, part)
-    assert [curve.lost.tolist() for curve in curves] == [[5, 5, 5]] * 2
-    assert np.isnan(curves[0].cost).all()
-    assert curves[0].success[-1] == 1.0
+    assert (curves["lost"] == 5).all()
+    assert curves["cost"].isna().all()
+    assert curves.loc["d_optimal", "success"].iloc[-1] == 1.0
     assert "| –, 5 lost |" in " ".join(control_table(table).markdown().split())
 
 
@@ -443,13 +446,15 @@ def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
     with filled(
         tmp_path, specs, edit=lambda spec, result: crashed(spec, missed(spec, result))
     ) as reader:
-        curves = measure_control(reader, control_part(select(reader, Filter())))
-    truth = curves[0].truth
-    assert truth == curves[1].truth
+        part = control_part(select(reader, Filter()))
+        truth = true_model(reader, part.of("pendulum"))
+        shown = control_of(reader, part, "pendulum")
     assert (truth.n, truth.lost) == (5, 1)  # each seed once
     assert truth.success == pytest.approx(3 / 5)
     assert truth.success_low < 3 / 5 < truth.success_high
-    assert {one.truth for one in curves} == {truth}
+    shown = shown[shown["variant"] == TRUTH]
+    assert shown["t"].tolist() == [0, 20, 60]
+    assert (shown[["n", "lost", "success"]] == [truth.n, truth.lost, truth.success]).all(axis=None)
 
 
 def test_a_grid_without_a_task_has_no_such_table(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import ScaleWarning, SpecificationError
-from dopt.kernel.state_from_spec import empty_record, initial_state
+from dopt.kernel.from_spec import empty_record, initial_state
 from dopt.randomness import draw
 from dopt.spec.config import LARGEST_HORIZON
 from dopt.spec.custom_system import check_system, warn_of_scale

@@ -393,7 +393,7 @@ def test_a_label_names_the_field_only_where_it_differs() -> None:
 
 def test_the_text_that_is_stored_is_the_one_whose_hash_is_the_key(tmp_path: Path) -> None:
     from orchestrate.commands.maintenance import trial_key
-    from orchestrate.store.doctor import examine
+    from orchestrate.store.maintenance import examine
     from tests.analysis.synthetic import fill
 
     for spec in (PLAIN, FRESH):

@@ -10,8 +10,7 @@ import pytest
 
 from dopt import Explorer
 from dopt.errors import IncompatibleError, ScaleWarning, SpecificationError
-from dopt.kernel.run import KernelTrial
-from dopt.kernel.steps import SteppedTrial
+from dopt.kernel.run import KernelTrial, SteppedTrial
 from dopt.kernel.structs import Record
 from dopt.limits import Limits
 from dopt.randomness import draw

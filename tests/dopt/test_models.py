@@ -15,11 +15,11 @@ from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.explorer import Explorer
-from dopt.kernel.learners.joint_kalman import run_filter
+from dopt.kernel.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS, RFF, GaussianProcess
 from dopt.models.gaussian_process import kernel
-from dopt.offline_fit import fit_offline, grid_loss, uniform_samples
+from dopt.offline_fit import fit_offline, grid_loss
 from dopt.randomness import PLANNED_DIMENSIONS, draw
 from dopt.run import rerun, run_trial
 from dopt.spec.config import PLAN_VERSION
@@ -29,6 +29,7 @@ from tests.dopt.kernel.twin import call, model_of_kernel
 from tests.dopt.oracles.traces import jacobian, observed, trace
 from tests.dopt.test_limits import ABSOLUTE, ANGLE, CART, DEGREE, JOINTS, sensed
 from tests.dopt.trials import trial
+from tests.dopt.uniform import uniform_samples
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
     "gaussian_process": "conditioning"

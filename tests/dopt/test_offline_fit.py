@@ -16,8 +16,8 @@ from dopt import Explorer
 from dopt.assessment import loss_by_parameter_error, parameter_error, true_parameters
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.kernel.learners import joint_kalman
-from dopt.kernel.learners.joint_kalman import run_filter
+from dopt.kernel import joint_kalman
+from dopt.kernel.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.offline_fit import (
     RIDGE,
@@ -29,7 +29,6 @@ from dopt.offline_fit import (
     jacobian,
     predicted_variances,
     recorded_samples,
-    uniform_samples,
 )
 from dopt.randomness import draw, initial_weights
 from dopt.reference.models import mlp_function
@@ -47,6 +46,7 @@ from tests.dopt.oracles.test_joint_kalman import filtered
 from tests.dopt.oracles.traces import model_step
 from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, measures, sensed
 from tests.dopt.trials import trial
+from tests.dopt.uniform import uniform_samples
 
 SMALL = {"width": 4, "depth": 2}
 

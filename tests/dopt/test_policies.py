@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.kernel.steps import SteppedTrial
+from dopt.kernel.run import SteppedTrial
 from dopt.policies import POLICIES
 from dopt.policies.base import OpenLoop
 from dopt.policies.held_candidates import DisagreementPlan, SpaceFilling, SpaceFillingPlan

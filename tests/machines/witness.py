@@ -18,7 +18,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate import launch
 from orchestrate.runner import start
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner.start import Work
 
 PAUSE = "WITNESS_PAUSE"
 HOLD = "WITNESS_HOLD"

@@ -27,7 +27,7 @@ from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run
-from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import LaunchRecord
 from tests.orchestrate.standins import quick, specification
 from tests.paths import ROOT

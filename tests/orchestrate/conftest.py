@@ -15,7 +15,7 @@ from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
 from orchestrate.program import readable_streams
-from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import LaunchRecord, Reader
 from tests.hydra_files import parse_once
 from tests.orchestrate.standins import quick, specification

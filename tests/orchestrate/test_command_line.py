@@ -23,8 +23,8 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import main as orchestrate
 from orchestrate.commands import COMMANDS
 from orchestrate.program import SUCCESSORS
-from orchestrate.runner import run_grid
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner import start
+from orchestrate.runner.start import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
 from orchestrate.store.backends.base import parse_url
 from orchestrate.store.backends.sqlite_engine import existing_path
@@ -220,7 +220,7 @@ def test_a_failed_trial_says_how_to_run_it_again(
 def test_a_slow_preparation_is_announced_also_for_a_single_trial(
     command_line: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrate.runner.run_grid.ANNOUNCE_AFTER_SECONDS", 0.01)
+    monkeypatch.setattr("orchestrate.runner.start.ANNOUNCE_AFTER_SECONDS", 0.01)
 
     @contextmanager
     def prepare(_: object) -> Iterator[None]:
@@ -327,7 +327,7 @@ def test_a_defect_of_the_program_is_not_taken_for_failed_trials(
     def broken(*_: object) -> None:
         raise AssertionError("nobody thought of postgresql://me:secret@host/db")
 
-    monkeypatch.setattr("orchestrate.runner.run_grid.Chunks", broken)
+    monkeypatch.setattr("orchestrate.runner.start.Chunks", broken)
     url = f"sqlite:///{tmp_path}/results.db"
     code, _, errors = command_line("env=pendulum", f"store.url={url}")
     assert code == 70
@@ -344,7 +344,7 @@ def test_a_single_trial_that_is_interrupted_before_its_start_says_so(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_grid, "free_trials", interrupted)
+    monkeypatch.setattr(start, "free_trials", interrupted)
     code, output, errors = command_line("env=pendulum", *SHORT)
     assert (code, errors) == (130, "")
     assert re.fullmatch(r"env=pendulum .* · not started · sqlite:.*\n", output)

@@ -19,10 +19,9 @@ from orchestrate.__main__ import main
 from orchestrate.config import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings, Share, share
 from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.runner.run_grid import Work, collected, launch_grid
+from orchestrate.runner.start import Work, collected, launch_grid
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError
-from orchestrate.store.doctor import examine
-from orchestrate.store.maintenance import collect, merge_collected
+from orchestrate.store.maintenance import collect, examine, merge_collected
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.faults.laboratory import flaws, results
 from tests.orchestrate.standins import grid_of, specification

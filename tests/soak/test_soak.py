@@ -14,7 +14,7 @@ from tabulate import tabulate
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings, Share
 from orchestrate.errors import ExitCode
-from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store.maintenance import merge_collected
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.faults.conftest import (  # noqa: F401  fixtures, which pytest finds here

@@ -30,12 +30,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError
 
 from dopt.errors import given_path, stripped
 from dopt.types import Array
-from orchestrate.errors import (
-    QueryError,
-    SchemaVersionError,
-    StoreError,
-    StoreUnavailableError,
-)
+from orchestrate.errors import QueryError, SchemaVersionError, StoreError, StoreUnavailableError
 from orchestrate.records import URL_VARIABLE
 
 DEFAULT_URL = "sqlite:///results/results.db"

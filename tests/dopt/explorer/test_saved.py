@@ -42,7 +42,7 @@ from orchestrate.store import (
     explorations,
 )
 from orchestrate.store import results as writing
-from orchestrate.store.doctor import examine
+from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
 from tests.dopt.explorer.plants import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN, begin

@@ -15,7 +15,7 @@ import pytest
 from dopt import LEARNERS, Explorer, Plant
 from dopt.spec.scaled import scaled
 from dopt.systems.black_box import differentiated, rate_factors
-from dopt.systems.scales import STEPS_ACROSS
+from dopt.systems.properties import STEPS_ACROSS
 from dopt.types import Array
 from tests.dopt.explorer.plants import HOVERCRAFT, steered
 

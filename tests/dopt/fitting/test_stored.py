@@ -23,7 +23,7 @@ from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, StoreError, StoreUnavailableError
 from orchestrate.store import results as writing
-from orchestrate.store.doctor import examine
+from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
 from tests.analysis.synthetic import fill, make_grid
 from tests.dopt.fitting.test_fit import declared, run

@@ -155,7 +155,7 @@ def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatc
         "dopt.kernel.loop.keep_state",
         "dopt.kernel.integration.observe_euler",
         "dopt.kernel.policies.plan_d_optimal",
-        "dopt.kernel.learners.adam.learn",
+        "dopt.kernel.learners.learn_newest",
         "dopt.kernel.information.add_network_rows",
         "dopt.kernel.information.network_forms",
     }
@@ -355,7 +355,7 @@ class NewPolicy(ClosedLoop):
 class NewLearner(Learner):
     name: ClassVar[str] = "new"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.adam.forgotten"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.forgotten"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from torch.func import jacrev, vmap
 
 from dopt.assessment import model_forecast
 from dopt.errors import IncompatibleError
-from dopt.kernel.learners.kalman import filter_step, whiten
+from dopt.kernel.learners import filter_step, whiten
 from dopt.kernel.linear_algebra import dense, initial_covariance
 from dopt.kernel.run import KernelTrial
 from dopt.learning import LEARNERS, ExtendedKalman

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.evaluation import evaluation_set, reachable_states
-from dopt.kernel.search.sampling import domain_weight
+from dopt.evaluation import domain_box, evaluation_set, goal_weights, reachable_states, task_states
+from dopt.kernel.sampling import domain_weight
 from dopt.policies import Exact, Lookahead, Search, TaskOptimal
 from dopt.policies.d_optimal import ascend, is_linear
 from dopt.policies.search import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
-from dopt.policies.task_states import domain_box, goal_weights, task_states
 from dopt.randomness import draw
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

@@ -12,8 +12,7 @@ from numba.core.dispatcher import Dispatcher
 from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.loop import advance
 from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
-from dopt.kernel.run import KernelTrial
-from dopt.kernel.steps import KernelSteps, NumpyParts
+from dopt.kernel.run import KernelSteps, KernelTrial, NumpyParts
 from dopt.kernel.structs import Evaluation
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView

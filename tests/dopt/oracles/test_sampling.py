@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dopt.evaluation import box_states
 from dopt.policies import ICEM
-from dopt.policies.task_states import box_states
 from dopt.randomness import draw
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.evaluation import task_states
 from dopt.policies import InformationPolicy, Lookahead, Search, TaskOptimal
-from dopt.policies.task_states import task_states
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.dopt.oracles.traces import Trace, information, jacobian, model_step, trace

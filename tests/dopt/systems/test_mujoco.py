@@ -15,12 +15,12 @@ import pytest
 from dopt.errors import IncompatibleError, SpecificationError, install_command
 from dopt.evaluation import evaluation_set
 from dopt.fields import parameter
-from dopt.offline_fit import uniform_samples
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SIMULATORS, Feature
 from dopt.systems.mujoco import MuJoCo, MuJoCoPendulum
 from dopt.types import Array, Scalar
+from tests.dopt.uniform import uniform_samples
 
 mujoco = pytest.importorskip("mujoco", reason="needs the extra mujoco")
 

@@ -294,10 +294,7 @@ def test_a_done_trial(ask: Run) -> None:
     spec = DONE[1]
     out = ask("show", spec.trial_key[:8]).out
     loss = result(spec.seed).loss
-    assert out.startswith(
-        f"{spec.trial_key[:12]} (env=pendulum policy=random model=mlp learner=adam_window "
-        "width=16 depth=2 horizon=7 dt=0.01 gamma=1.5 seed=1)\n"
-    )
+    assert out.startswith(f"{spec.trial_key[:12]} (pendulum, random, seed 1)\n")
     assert f"done · final loss {loss[-1]:.6g} · best loss {loss.min():.6g}" in out
     assert "horizon=7" in out
     assert "commit   0000000000000000000000000000000000000000, with changes (diff 1111" in out
@@ -374,16 +371,16 @@ def test_what_is_ambiguous_is_refused_with_the_choices(ask: Run) -> None:
     assert answer.code == 2
     assert "2 trials have these names, one is expected: give the key of one of" in answer.err
     assert RUNNING.trial_key[:12] in answer.err
-    assert "env=cartpole policy=random width=8 seed=0" in answer.err
+    assert "(cartpole, random, width=8, seed 0)" in answer.err
 
 
-def test_choices_name_the_columns_in_which_they_differ(ask: Run, store: Store) -> None:
+def test_choices_have_labels_that_tell_them_apart(ask: Run, store: Store) -> None:
     number = store.begin_launch(LAUNCH)
     others = [Spec(9, gamma=0.5), Spec(9, gamma=3.0, task="control")]
     store.register(number, others)
     error = ask("show", "--seed", "9").err
-    assert "(env=pendulum policy=random width=16 gamma=0.5 seed=9)" in error
-    assert "(env=pendulum policy=random width=16 gamma=3.0 task=control seed=9)" in error
+    assert "(pendulum, random, gamma=0.5, seed 9)" in error
+    assert "(pendulum, random, gamma=3.0, task=control, seed 9)" in error
 
 
 @pytest.mark.parametrize(

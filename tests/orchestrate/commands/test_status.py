@@ -24,8 +24,9 @@ from orchestrate.commands.status import watch
 from orchestrate.executors.base import Event, InProcessExecutor, Task
 from orchestrate.fingerprint import fingerprint
 from orchestrate.program import UsageError, length_of_time, visible
-from orchestrate.runner import run_grid, worker
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner import start as runner
+from orchestrate.runner import worker
+from orchestrate.runner.start import Work
 from orchestrate.store import (
     Claim,
     ConfigRow,
@@ -55,11 +56,11 @@ class TestOnce:
     def test_counts_each_config(self, command: Run) -> None:
         table = rows(command("status").out)
         assert [" ".join(row) for row in table[:6]] == [
-            "env policy width done of failed diverged running pending",
-            "cartpole random - 0 2 - - - 2",
-            "cartpole random 8 0 1 - - 1 -",
-            "pendulum d_optimal 16 0 3 2 1 - -",
-            "pendulum random 16 3 3 - - - -",
+            "env label done of failed diverged running pending",
+            "cartpole random, width=None 0 2 - - - 2",
+            "cartpole random, width=8 0 1 - - 1 -",
+            "pendulum d_optimal 0 3 2 1 - -",
+            "pendulum random 3 3 - - - -",
             "total 3 9 2 1 1 2",
         ]
 
@@ -173,7 +174,10 @@ class TestTable:
 
     def test_what_tells_configurations_apart_is_shown(self, reader: Reader, store: Store) -> None:
         configs = self.configs(reader, store, [Spec(horizon=5), Spec(horizon=6)])
-        assert self.shown(configs, 10)[0][:4] == ["env", "policy", "width", "horizon"]
+        table = self.shown(configs, 10)
+        assert table[0][:2] == ["env", "label"]
+        labels = {" ".join(row[:3]) for row in table[1:3]}
+        assert labels == {"pendulum random, horizon=5", "pendulum random, horizon=6"}
 
     def shown(self, configs: list[ConfigRow], most: int) -> list[list[str]]:
         console = Console(file=io.StringIO(), width=200)
@@ -350,7 +354,7 @@ def pull(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DOPT_DB", raising=False)
     monkeypatch.setattr(worker, "WORK", Work(raising))
-    monkeypatch.setattr(run_grid, "make_executor", lambda _, run, __: InProcessExecutor(run))
+    monkeypatch.setattr(runner, "make_executor", lambda _, run, __: InProcessExecutor(run))
 
     def run(*words: str) -> tuple[int, str, str]:
         code = main(words)
@@ -411,7 +415,7 @@ def test_a_trial_that_was_taken_away_is_not_run_twice_at_once(
             self.held |= {*keys(chunk)}
 
     executor = Watched(fate)
-    monkeypatch.setattr(run_grid, "make_executor", lambda *_: executor)
+    monkeypatch.setattr(runner, "make_executor", lambda *_: executor)
     code, out, _ = pull("work")
     assert "results refused: the lease had run out" in out
     assert "6 trials done" in out

@@ -323,7 +323,7 @@ LAUNCH = """
 import json, sys
 from orchestrate.runner import start
 from orchestrate import launch
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner.start import Work
 from tests.orchestrate.standins import quick
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import local
 from orchestrate.runner import scheduler, start, worker
-from orchestrate.runner.run_grid import Output, Work
+from orchestrate.runner.start import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
 from orchestrate.store.backends.postgresql import PostgreSQLBackend

@@ -14,7 +14,7 @@ from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate import launch
 from orchestrate.runner import start
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner.start import Work
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.faults.laboratory import Rows, flaws, results
 from tests.orchestrate.faults.trials import Gate, Gated

@@ -19,8 +19,8 @@ from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Event, Executor, Task, WorkerLost, run_task
-from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
+from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import Claim, Store, StoreUnavailableError
 from orchestrate.store.records import utc_text
 from tests.orchestrate.conftest import RECORD, Launches
@@ -200,7 +200,7 @@ def scripted(
 
     def launch(fate: Fate, seeds: int = 5, **settings: object) -> tuple[ExitCode, Scripted]:
         executor = Scripted(fate)
-        monkeypatch.setattr("orchestrate.runner.run_grid.make_executor", lambda *_: executor)
+        monkeypatch.setattr("orchestrate.runner.start.make_executor", lambda *_: executor)
         return launches(seeds=seeds, **settings), executor  # type: ignore[arg-type]
 
     return launch

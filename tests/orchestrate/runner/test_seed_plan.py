@@ -18,7 +18,6 @@ from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
-from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.scheduler import (
     FEWEST_SEEDS,
     FEWEST_VALUES,
@@ -27,6 +26,7 @@ from orchestrate.runner.scheduler import (
     is_narrow,
     looks,
 )
+from orchestrate.runner.start import Work, launch_grid
 from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.standins import diverged, grid_of, quick
 

@@ -50,6 +50,12 @@ class Spec:
     gamma: float = 1.5
     task: str | None = None
 
+    @property
+    def label(self) -> str:
+        usual = {"width": 16, "horizon": HORIZON, "gamma": 1.5, "task": None}
+        own = [f"{k}={getattr(self, k)}" for k, v in usual.items() if getattr(self, k) != v]
+        return ", ".join([self.policy, *own])
+
     def columns(self) -> Mapping[str, Any]:
         return {
             "env": self.env,
@@ -61,7 +67,7 @@ class Spec:
             "horizon": self.horizon,
             "dt": 0.01,
             "gamma": self.gamma,
-            "label": self.policy,
+            "label": self.label,
         }
 
     @property

@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreError
-from orchestrate.store.doctor import Finding, examine
+from orchestrate.store.maintenance import Finding, examine
 from orchestrate.store.schema import STEP_VALUES
 from tests.orchestrate.store.databases import columns, contents, execute
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result, run_all

@@ -19,7 +19,7 @@ from orchestrate.executors.limits import Limits
 from orchestrate.records import Failure
 from orchestrate.runner.saving import Heartbeat
 from orchestrate.store import Reader, Store
-from orchestrate.store.doctor import examine
+from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import Source, merge
 from orchestrate.store.store import LEASE_SECONDS
 from tests.dopt.trials import trial

@@ -27,7 +27,7 @@ from orchestrate.store import (
 )
 from orchestrate.store import merge as source
 from orchestrate.store import schema as schema_version
-from orchestrate.store.doctor import examine
+from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.schema import metadata
 from tests.orchestrate.store.conftest import each_other

@@ -22,8 +22,7 @@ from orchestrate.store import (
     Store,
     StoreUnavailableError,
 )
-from orchestrate.store.doctor import examine
-from orchestrate.store.maintenance import upgrade
+from orchestrate.store.maintenance import examine, upgrade
 from orchestrate.store.records import DTYPE, finite_list, pack, unpack, utc_text
 from orchestrate.store.schema import STEP_VALUES
 from tests.orchestrate.store.databases import execute

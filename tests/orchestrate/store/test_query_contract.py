@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from orchestrate.errors import ExitCode
-from orchestrate.store import Claim, QueryError, Reader, Store, StoreUnavailableError, user_query
+from orchestrate.store import Claim, QueryError, Reader, Store, StoreUnavailableError
+from orchestrate.store import reader as user_query
 from tests.orchestrate.faults.laboratory import PATIENCE_SECONDS, alive, children, until
 from tests.orchestrate.store.fakes import HORIZON, RUN, Spec, result
 

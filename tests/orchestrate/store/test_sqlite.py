@@ -27,7 +27,7 @@ from orchestrate.store import (
 )
 from orchestrate.store.backends import sqlite_engine
 from orchestrate.store.backends.sqlite_engine import _is_read_only, read_address
-from orchestrate.store.doctor import examine
+from orchestrate.store.maintenance import examine
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
 from tests.orchestrate.store.processes import (
     eight_open,

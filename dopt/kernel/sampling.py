@@ -1,4 +1,4 @@
-"""Sampling planners in compiled code (:mod:`dopt.policies.icem`): at each step, or in episodes.
+"""Sampling planners in compiled code (:mod:`dopt.policies.search`): at each step, or in episodes.
 
 Sizes beside :mod:`dopt.kernel.structs`: H steps of a plan, K inputs of it, P plans, n states of its
 path whose rows count, g + s directions. The numbers of the episodic planner end with the steps k
@@ -29,9 +29,8 @@ from dopt.kernel.linear_algebra import (
     write_dense,
 )
 from dopt.kernel.model import n_next_points, next_points, parameter_rows, rows_at, write_features
-from dopt.kernel.network import multiply_vector, output_inputs
-from dopt.kernel.network_gradients import batch_back_signals
-from dopt.kernel.search.path import advance_paths, keep_points, paths_from
+from dopt.kernel.network import batch_back_signals, multiply_vector, output_inputs
+from dopt.kernel.search import advance_paths, keep_points, paths_from
 from dopt.kernel.structs import Covariance, Network, Plant, State, Trial
 from dopt.kernel.vectors import (
     add_multiple,

@@ -1,4 +1,4 @@
-"""Kalman filter over state and parameters in compiled code (:mod:`dopt.learning.least_squares`).
+"""Kalman filter over state and parameters in compiled code (:mod:`dopt.learning.online`).
 
 Its numbers are λ, the ρ of the beginning, ζ, the steps from one fit to the next, the Gauss-Newton
 steps of a fit, and whether it estimates ρ.
@@ -16,9 +16,7 @@ import numpy as np
 from dopt.algorithm import MOST_NOISE_FACTORS, NO_GROWTH, NOISE_FACTORS, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import next_model_state
-from dopt.kernel.learners.adam import sampled_point
-from dopt.kernel.learners.gauss_newton import squared_distance
-from dopt.kernel.learners.kalman import filter_step, model_rows
+from dopt.kernel.learners import filter_step, model_rows, sampled_point, squared_distance
 from dopt.kernel.linear_algebra import (
     factorize,
     quadratic_forms,

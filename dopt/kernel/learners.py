@@ -1,6 +1,15 @@
-"""Fits of a network to many samples in compiled code: in a trial, and to given samples.
+"""Learners in compiled code: Adam, recursive learners, and fits to many samples.
 
-In a trial (:mod:`dopt.learning.least_squares`) the numbers are λ, ρ, the steps from one fit to the
+Adam (:mod:`dopt.learning.online`), on the newest samples or a replay buffer: its numbers are the
+learning rate, β₁, β₂ and ε.
+
+Recursive learners (:mod:`dopt.learning.online`): recursive least squares; the extended
+Kalman filter, whose numbers are ρ, the forgetting factor f, the count of diagonal entries of M
+renewed at a step, what each gets back, and ζ; and conditioning of a Gaussian process.
+
+Fits of a network to many samples in compiled code: in a trial, and to given samples.
+
+In a trial (:mod:`dopt.learning.online`) the numbers are λ, ρ, the steps from one fit to the
 next, the Gauss-Newton steps of a fit, and whether one that overshoots is damped. To given samples
 (:mod:`dopt.offline_fit`) a network is fitted by the method of Levenberg and Marquardt:
 
@@ -29,19 +38,267 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import DAMPINGS, NO_GROWTH, SMALLEST_SHARE, ModelKind
-from dopt.kernel import model_kinds
 from dopt.kernel.compiler import called_from_python, compiled, squared
-from dopt.kernel.learners.adam import sampled_point, store_sample
-from dopt.kernel.learners.kalman import filter_sample
-from dopt.kernel.linear_algebra import factorize, replaced, solve, write_inverse
+from dopt.kernel.gaussian_process import add_sample
+from dopt.kernel.linear_algebra import (
+    append_row,
+    factorize,
+    quadratic_forms,
+    rank_update,
+    replaced,
+    settle,
+    solve,
+    solve_columns,
+    write_inverse,
+)
+from dopt.kernel.model import (
+    model_point,
+    parameter_rows,
+    sampled_state,
+    squared_error,
+    write_jacobian,
+    write_normal_equations,
+)
+from dopt.kernel.network import features_at, loss_gradient
 from dopt.kernel.normal_equations import errors_of, normal_equations, write_products
-from dopt.kernel.structs import Network, Plant, State, Trial
-from dopt.kernel.vectors import inner
+from dopt.kernel.structs import Covariance, Network, Plant, State, Trial
+from dopt.kernel.vectors import LANES, add_multiple, inner, multiply_add
 from dopt.types import Matrix, Vector
 
 
 @compiled
-def learn(trial: Trial, t: int, target: Vector) -> None:
+def sampled_point(trial: Trial, t: int) -> Vector:
+    """Return where the accelerations of step t were observed: a state, or a state and u_t."""
+    state = sampled_state(trial.plant, trial.record.states, t)
+    return model_point(trial.network, state, trial.state.estimate.inputs[t])
+
+
+@compiled
+def store_sample(
+    network: Network, features: Matrix, targets: Matrix, t: int, x: Vector, target: Vector
+) -> None:
+    """Put the features of a point and the accelerations observed there, (r,), into a ring."""
+    slot = t % features.shape[1]
+    phi = np.empty(network.feature_kinds.shape[0])
+    features_at(network, x, phi)
+    for i in range(phi.shape[0]):
+        features[i, slot] = phi[i]
+    for k in range(target.shape[0]):
+        targets[k, slot] = target[k]
+
+
+@compiled
+def learn_newest(trial: Trial, t: int, target: Vector) -> None:
+    """Take Adam's step t + 1 on the newest samples, which the state's window holds."""
+    features, targets = trial.state.window_features, trial.state.window_targets
+    store_sample(trial.network, features, targets, t, sampled_point(trial, t), target)
+    if t + 1 < features.shape[1]:
+        features = features[:, : t + 1].copy()
+        targets = targets[:, : t + 1].copy()
+    adam_step(trial, t, features, targets)
+
+
+@compiled
+def adam_step(trial: Trial, step: int, features: Matrix, targets: Matrix) -> None:
+    """Take step ``step`` + 1 on a batch: features (p, n) and observed accelerations (r, n)."""
+    network, state, scratch = trial.network, trial.state, trial.scratch
+    theta, gradient = state.theta, scratch.gradient
+    if network.kind == ModelKind.MLP:
+        loss_gradient(network, theta, features, targets, scratch.hidden, scratch.deltas, gradient)
+    else:
+        normal = np.empty((theta.shape[0], theta.shape[0]))
+        write_normal_equations(trial.plant, network, theta, features, targets, normal, gradient)
+        gradient *= -2.0 / features.shape[1]
+    adam_update(trial.algorithm.learner, step, theta, state.moment_1, state.moment_2, gradient)
+
+
+@compiled
+def adam_update(
+    numbers: Vector, t: int, theta: Vector, moment_1: Vector, moment_2: Vector, gradient: Vector
+) -> None:
+    """Move θ, (q,), and the moments, (q,), along a gradient: step t + 1."""
+    learning_rate, beta_1, beta_2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
+    correction_1, correction_2 = _sum_of_weights(beta_1, t + 1), _sum_of_weights(beta_2, t + 1)
+    rest_1, rest_2, rate, scale = (
+        1.0 - beta_1,
+        1.0 - beta_2,
+        learning_rate / correction_1,
+        1.0 / correction_2,
+    )
+    for i in range(gradient.shape[0]):
+        g = gradient[i]
+        moment_1[i] = multiply_add(beta_1, moment_1[i], rest_1 * g)
+        moment_2[i] = multiply_add(beta_2, moment_2[i], rest_2 * g * g)
+        deviation = np.sqrt(moment_2[i] * scale)
+        theta[i] -= rate * moment_1[i] / (deviation + epsilon)
+
+
+@compiled
+def _sum_of_weights(beta: float, n: int) -> float:
+    """Return the sum of the weights that a moment of decay β gives to n gradients."""
+    return float(1.0 - beta**n)
+
+
+@compiled
+def learn_from_replay(trial: Trial, t: int, target: Vector) -> None:
+    """Take Adam's steps of time t, one for each row of places in the buffer, (steps, batch)."""
+    state, places = trial.state, trial.randomness.replay[t]
+    seen, observed = state.window_features, state.window_targets
+    store_sample(trial.network, seen, observed, t, sampled_point(trial, t), target)
+    steps, batch = places.shape
+    features = np.empty((seen.shape[0], batch))
+    targets = np.empty((observed.shape[0], batch))
+    for s in range(steps):
+        for j in range(batch):
+            place = places[s, j]
+            for i in range(features.shape[0]):
+                features[i, j] = seen[i, place]
+            for k in range(targets.shape[0]):
+                targets[k, j] = observed[k, place]
+        step = t * steps + s
+        adam_step(trial, step, features, targets)
+
+
+@compiled
+def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
+    """Return J, (r, q), at a point, and write a_θ, (r,), there."""
+    rows = np.empty((value.shape[0], theta.shape[0]))
+    if network.kind == ModelKind.MLP:
+        write_jacobian(network, theta, x, rows, value)
+    else:
+        parameter_rows(plant, network, theta, x, rows, value)
+    return rows
+
+
+@compiled
+def filter_step(covariance: Covariance, theta: Vector, rows: Matrix, residuals: Vector) -> None:
+    """Add JᵀJ to M for J, (r, q), and correct θ by the residuals, (r,), which are overwritten."""
+    correction = rank_update(covariance, rows, residuals)
+    for i in range(theta.shape[0]):
+        theta[i] += correction[i]
+
+
+@compiled
+def forget(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
+    """Turn M⁻¹ into (f M + D)⁻¹ at step t (:class:`dopt.learning.ExtendedKalman`).
+
+    D has the entry ``renewal`` at the ``renewed`` diagonal places whose turn it is.
+    """
+    settle(covariance)
+    upper, pending, q = covariance.upper, covariance.pending, covariance.size
+    for i in range(q):
+        row = upper[i, i - i % LANES :]
+        for j in range(row.shape[0]):
+            row[j] /= forgetting
+    for k in range(covariance.n_pending[0]):
+        for j in range(q):
+            pending[k, j] /= np.sqrt(forgetting)
+    column = np.empty(q)
+    for n in range(renewed):
+        i = (t * renewed + n) % q
+        _read_column(covariance, i, column)
+        factor = np.sqrt(renewal / (1.0 + renewal * column[i]))
+        for j in range(q):
+            column[j] *= factor
+        append_row(covariance, column)
+
+
+@compiled
+def _read_column(covariance: Covariance, i: int, out: Vector) -> None:
+    """Write column i of M⁻¹, (q,)."""
+    upper, pending, q = covariance.upper, covariance.pending, covariance.size
+    for j in range(out.shape[0]):
+        out[j] = upper[min(i, j), max(i, j)]
+    for k in range(covariance.n_pending[0]):
+        add_multiple(out, -pending[k, i], pending[k, :q])
+
+
+@compiled
+def learn_recursively(trial: Trial, t: int, target: Vector) -> None:
+    """Take the least-squares step on the observed accelerations, (r,), and update M."""
+    theta, covariance = trial.state.theta, trial.state.covariance
+    residuals = np.empty(target.shape[0])
+    rows = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), residuals)
+    for k in range(target.shape[0]):
+        residuals[k] = target[k] - residuals[k]
+    filter_step(covariance, theta, rows, residuals)
+
+
+@compiled
+def learn_filtered(trial: Trial, t: int, target: Vector) -> None:
+    """Filter the observed accelerations, (r,): update θ and M."""
+    numbers = trial.algorithm.learner
+    filter_sample(trial, t, target, numbers[0], numbers[1], int(numbers[2]), numbers[3], numbers[4])
+
+
+@compiled
+def filter_sample(
+    trial: Trial,
+    t: int,
+    target: Vector,
+    noise_variance: float,
+    forgetting: float,
+    renewed: int,
+    renewal: float,
+    underweighting: float,
+) -> None:
+    """Update θ and M by the sample of step t, after M has faded by a factor."""
+    theta, covariance = trial.state.theta, trial.state.covariance
+    residuals = np.empty(target.shape[0])
+    rows = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), residuals)
+    for k in range(target.shape[0]):
+        residuals[k] = target[k] - residuals[k]
+    if forgetting < 1.0:
+        forget(covariance, forgetting, t, renewed, renewal)
+    if underweighting > 0.0:
+        whiten(covariance, rows, residuals, noise_variance, underweighting)
+    else:
+        scale_by_noise(rows, residuals, noise_variance)
+    filter_step(covariance, theta, rows, residuals)
+
+
+@compiled
+def scale_by_noise(rows: Matrix, residuals: Vector, noise_variance: float) -> None:
+    """Divide J, (r, q), and the residuals, (r,), by √ρ."""
+    scale = 1.0 / np.sqrt(noise_variance)
+    for k in range(rows.shape[0]):
+        residuals[k] *= scale
+        for i in range(rows.shape[1]):
+            rows[k, i] *= scale
+
+
+@compiled
+def whiten(
+    covariance: Covariance,
+    rows: Matrix,
+    residuals: Vector,
+    noise_variance: float,
+    underweighting: float,
+) -> None:
+    """Multiply J, (r, q), and the residuals, (r,), by L⁻¹, where L Lᵀ = ρI + ζ J M⁻¹ Jᵀ.
+
+    The residuals are NaN, which ends the trial as diverged, where rounding has left no L.
+    """
+    L = quadratic_forms(covariance, rows, rows)
+    for k in range(L.shape[0]):
+        for i in range(L.shape[1]):
+            L[k, i] = underweighting * L[k, i] + (noise_variance if i == k else 0.0)
+    if not factorize(L):
+        residuals[:] = np.nan
+        return
+    solve_columns(L, rows)
+    solve_columns(L, residuals.reshape(-1, 1))
+
+
+@compiled
+def condition(trial: Trial, t: int, target: Vector) -> None:
+    """Add the sample of step t, whose accelerations are (r,), to a Gaussian process."""
+    x = sampled_state(trial.plant, trial.record.states, t)
+    add_sample(trial.network, trial.state.theta, trial.state.posterior, x, target)
+
+
+@compiled
+def learn_fitted(trial: Trial, t: int, target: Vector) -> None:
     """Fit all samples, or filter the newest one between two fits."""
     numbers, state = trial.algorithm.learner, trial.state
     noise_variance, refit_every, steps = numbers[1], int(numbers[2]), int(numbers[3])
@@ -146,8 +403,8 @@ def _write_normal(
     """Write JᵀJ, (q, q), and Jᵀe, (q,), of a model of any kind; return ‖e‖²."""
     if network.kind == ModelKind.MLP:
         return normal_equations(network, theta, features, targets, normal, slope)
-    model_kinds.write_normal_equations(plant, network, theta, features, targets, normal, slope)
-    return model_kinds.squared_error(plant, network, theta, features, targets)
+    write_normal_equations(plant, network, theta, features, targets, normal, slope)
+    return squared_error(plant, network, theta, features, targets)
 
 
 @compiled
@@ -157,7 +414,7 @@ def _squared_error(
     """Return ‖e‖² of a model of any kind."""
     if network.kind == ModelKind.MLP:
         return errors_of(network, theta, features, targets)[0]
-    return model_kinds.squared_error(plant, network, theta, features, targets)
+    return squared_error(plant, network, theta, features, targets)
 
 
 @compiled

@@ -1,4 +1,9 @@
-"""Least squares: recursive, by Gauss-Newton steps, by Kalman filters; conditioning of a process.
+"""Online learners: Adam, least squares, Kalman filters, conditioning, fits beside a rig.
+
+Adam takes one step per time step t on the mean over the samples of ‖a_θ(x) - y‖², with y the
+observed accelerations (x_{t+1} - x_t)/dt less their known part: on the newest sample (Algorithm 1
+as printed), on a window of recent samples, or on replay. Least squares is recursive, by
+Gauss-Newton steps, or by Kalman filters:
 
 ======  ==================================================================  =========
 symbol  meaning                                                             shape
@@ -18,19 +23,22 @@ C       row of one measured state; its noise has the variance R             1 ×
 s       variance C P Cᵀ + R of the innovation y - C x̂, given θ              1
 ======  ==================================================================  =========
 
-References: A. Björck, "Numerical methods for least squares problems" (1996), for the damped
-Gauss-Newton method; L. Ljung and T. Söderström, "Theory and practice of recursive identification"
-(1983), for its recursive form, which is the step between two fits, and for forgetting; S. Singhal
-and L. Wu, "Training multilayer perceptrons with the extended Kalman algorithm" (1989); L. Ngia and
-J. Sjöberg, "Efficient training of neural nets for nonlinear adaptive filtering using a recursive
-Levenberg-Marquardt algorithm", IEEE Transactions on Signal Processing 48 (2000), for the renewal of
-the prior, some diagonal entries of M at a time; R. Zanetti, K. DeMars and R. Bishop,
-"Underweighting nonlinear measurements", Journal of Guidance, Control, and Dynamics 33 (2010), for
-the underweighting, which is due to W. Lear; B. Friedland, "Treatment of bias in recursive
-filtering", IEEE Transactions on Automatic Control 14 (1969), for the filter in two parts; L. Ljung,
-"Asymptotic behavior of the extended Kalman filter as a parameter estimator for linear systems",
-IEEE Transactions on Automatic Control 24 (1979), for why Ψ has to be in it; L. Ljung, "System
-identification: theory for the user" (1999), for the fit by errors of predictions.
+References: D. Kingma and J. Ba, "Adam: a method for stochastic optimization" (2015); L.-J. Lin,
+"Self-improving reactive agents based on reinforcement learning, planning and teaching", Machine
+Learning 8 (1992), for minibatches of all samples; A. Björck, "Numerical methods for least squares
+problems" (1996), for the damped Gauss-Newton method; L. Ljung and T. Söderström, "Theory and
+practice of recursive identification" (1983), for its recursive form, which is the step between two
+fits, and for forgetting; S. Singhal and L. Wu, "Training multilayer perceptrons with the extended
+Kalman algorithm" (1989); L. Ngia and J. Sjöberg, "Efficient training of neural nets for nonlinear
+adaptive filtering using a recursive Levenberg-Marquardt algorithm", IEEE Transactions on Signal
+Processing 48 (2000), for the renewal of the prior, some diagonal entries of M at a time; R.
+Zanetti, K. DeMars and R. Bishop, "Underweighting nonlinear measurements", Journal of Guidance,
+Control, and Dynamics 33 (2010), for the underweighting, which is due to W. Lear; B. Friedland,
+"Treatment of bias in recursive filtering", IEEE Transactions on Automatic Control 14 (1969), for
+the filter in two parts; L. Ljung, "Asymptotic behavior of the extended Kalman filter as a parameter
+estimator for linear systems", IEEE Transactions on Automatic Control 24 (1979), for why Ψ has to be
+in it; L. Ljung, "System identification: theory for the user" (1999), for the fit by errors of
+predictions.
 """
 
 from __future__ import annotations
@@ -40,6 +48,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from dopt.fields import parameter
 from dopt.learning.base import CustomLearner, InformationLearner, Learner, Updater
@@ -49,6 +58,102 @@ from dopt.types import Array
 
 NEVER = 2**31
 """Steps that no trial has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamRule(Learner):
+    """Base of the learners that take Adam's steps.
+
+    Parameters
+    ----------
+    learning_rate : float
+        Step size η.
+    beta_1, beta_2 : float
+        Decay rates of the first and the second moment.
+    epsilon : float
+        Regulariser of the denominator.
+    """
+
+    learning_rate: float = parameter(2e-3, bound="positive")
+    beta_1: float = parameter(0.9, bound="fraction")
+    beta_2: float = parameter(0.999, bound="fraction")
+    epsilon: float = parameter(1e-8, bound="positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adam(AdamRule):
+    """One Adam step on the newest sample at each time step.
+
+    Parameters
+    ----------
+    window : int
+        Number of newest samples in the loss; while fewer have been seen, those.
+    """
+
+    name: ClassVar[str] = "adam"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.learn_newest"
+    reads_inputs: ClassVar[bool] = True
+
+    window: int = parameter(1, "samples", "positive")
+
+    def samples_kept(self, horizon: int) -> int:  # noqa: ARG002  # the window has its own size
+        return self.window
+
+    def largest_batch(self) -> int:
+        return self.window
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamWindow(Adam):
+    """One Adam step on the newest 100 samples, as in the authors' released code."""
+
+    name: ClassVar[str] = "adam_window"
+    compiled: ClassVar[bool] = True
+
+    learning_rate: float = parameter(1e-2, bound="positive")
+    window: int = parameter(100, "samples", "positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamReplay(AdamRule):
+    """Some Adam steps at each time step, each on samples drawn from the buffer with replacement.
+
+    The sample of time t takes place t mod ``capacity`` of the buffer, in which the oldest one was.
+
+    Parameters
+    ----------
+    capacity : int
+        Number of newest samples that the buffer holds.
+    batch : int
+        Samples of a minibatch.
+    steps : int
+        Minibatches, and Adam steps, at each time step.
+    """
+
+    name: ClassVar[str] = "adam_replay"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.learn_from_replay"
+    reads_inputs: ClassVar[bool] = True
+
+    learning_rate: float = parameter(3e-3, bound="positive")
+    capacity: int = parameter(10_000, "samples", "positive")
+    batch: int = parameter(100, "samples", "positive")
+    steps: int = parameter(30, "steps", "positive")
+
+    def samples_kept(self, horizon: int) -> int:
+        return min(self.capacity, horizon)
+
+    def largest_batch(self) -> int:
+        return self.batch
+
+    def places(self, horizon: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+        """Draw the places of the buffer that the minibatches are made of, (T, steps, batch).
+
+        At time t they are uniform over the min(t + 1, capacity) places that hold a sample.
+        """
+        filled = np.minimum(np.arange(1, horizon + 1), self.capacity)
+        return rng.integers(filled[:, None, None], size=(horizon, self.steps, self.batch))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +171,7 @@ class RecursiveLeastSquares(Learner):
 
     name: ClassVar[str] = "recursive_least_squares"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn_recursively"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.learn_recursively"
     reads_inputs: ClassVar[bool] = True
     updates_information: ClassVar[bool] = True
     structure: ClassVar[str] = "least_squares"
@@ -93,7 +198,7 @@ class Conditioning(Learner):
     name: ClassVar[str] = "conditioning"
     structure: ClassVar[str] = "conditioning"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.condition"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.condition"
 
     first_rows: int = parameter(10, "samples", "positive", added=True)
     growth: float = parameter(0.25, bound="positive", added=True)
@@ -133,7 +238,7 @@ class GaussNewton(InformationLearner):
 
     name: ClassVar[str] = "gauss_newton"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.gauss_newton.learn"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.learn_fitted"
     reads_inputs: ClassVar[bool] = True
 
     capacity: int = parameter(10_000, "samples", "positive")
@@ -200,7 +305,7 @@ class ExtendedKalman(InformationLearner):
 
     name: ClassVar[str] = "ekf"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.learn_filtered"
     reads_inputs: ClassVar[bool] = True
 
     forgetting: float = parameter(1.0, bound="share")
@@ -267,7 +372,7 @@ class JointKalman(InformationLearner):
 
     name: ClassVar[str] = "joint_ekf"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.joint_kalman.learn"
+    kernel_function: ClassVar[str] = "dopt.kernel.joint_kalman.learn"
     reads_inputs: ClassVar[bool] = True
     estimates_states: ClassVar[bool] = True
 

@@ -1,1 +1,0 @@
-"""Compiled functions that update the parameters, one file for each learner."""

@@ -1,1 +1,0 @@
-"""Compiled search for the best plan among a finite set."""
