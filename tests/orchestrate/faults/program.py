@@ -20,6 +20,7 @@ from typing import Any
 
 import psycopg
 
+from orchestrate.config.command_line import Request
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import local
@@ -112,7 +113,7 @@ def _launch(order: Order) -> int:
     start.WORK = work
     chosen = {"workers": 2, "chunk_seconds": 0.2, **order.settings}
     settings = LaunchSettings(order.executor, order.url, **chosen)
-    request = start.Request((), {}, (), single=False)
+    request = Request((), {}, (), single=False)
     try:
         return start.run(request, grid_of(order.trials), settings)
     except KeyboardInterrupt:
