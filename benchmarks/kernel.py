@@ -134,7 +134,6 @@ def _seconds(spec: TrialSpec) -> tuple[float, float]:
 
 
 BATCH = 100
-GPU_BATCHES = (BATCH, 4_096)
 SKIPPED = 14
 """First steps of a batch, in which torch allocates."""
 
@@ -144,24 +143,17 @@ SETTLED = 160
 
 def reference(quick: bool) -> list[Row]:
     """Return the cost of a step for each trial of a batch, and trial-steps per second."""
-    import torch
-
-    rows = _rows(1, SETTLED)
-    if not quick:
-        rows += _rows(BATCH, SKIPPED + 10)
-    if not quick and torch.cuda.is_available():
-        rows += [row for size in GPU_BATCHES for row in _rows(size, SETTLED, "cuda")]
-    return rows
+    return _rows(1, SETTLED) + ([] if quick else _rows(BATCH, SKIPPED + 10))
 
 
-def _rows(size: int, steps: int, device: str = "cpu") -> list[Row]:
+def _rows(size: int, steps: int) -> list[Row]:
     from dopt.reference.batch import run_trials
 
     specs = [cartpole(seed=seed, horizon=steps) for seed in range(size)]
-    result = run_trials(specs, device)[0]
+    result = run_trials(specs)[0]
     plan, learn, evaluation = _settled(result)
-    what = f"torch, {f'{size} trials in lockstep' if size > 1 else 'one trial'} on {device}"
-    known = LOCKSTEP if size == BATCH and device == "cpu" else None
+    what = f"torch, {f'{size} trials in lockstep' if size > 1 else 'one trial'} on cpu"
+    known = LOCKSTEP if size == BATCH else None
     note = f"{min(steps, 100)} samples in the window"
     return [
         Row(what, plan + learn, "µs a step", anchor=known, note=note),

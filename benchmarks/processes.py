@@ -64,7 +64,7 @@ def run(*arguments: str) -> Finished:
         )
         peak = float("nan")
         while process.poll() is None:
-            peak = _peak_mebibytes(process.pid, peak)
+            peak = peak_mebibytes(process.pid, peak)
             time.sleep(POLL_SECONDS)
         seconds = time.perf_counter() - clock
         output.seek(0)
@@ -82,7 +82,7 @@ def _children_cpu_seconds() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def _peak_mebibytes(pid: int, before: float) -> float:
+def peak_mebibytes(pid: int, before: float) -> float:
     """Return the largest resident memory so far, or ``before`` once the process has ended.
 
     The kernel's account at the end (``ru_maxrss``) holds the memory of the process that started it.

@@ -11,8 +11,9 @@ history would lose its measure.
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +117,17 @@ def number(value: float) -> str:
     if abs(value) >= 100:
         return f"{value:,.0f}"
     return f"{value:.3g}"
+
+
+def show(rows: Iterable[Row]) -> list[Row]:
+    """Print each row as it is measured, and return all of them."""
+    shown = []
+    for row in rows:
+        value = "left out" if row.value is None else f"{number(row.value)} {row.unit}"
+        sys.stdout.write(f"{row.what}: {value.strip()}{f' ({row.note})' if row.note else ''}\n")
+        sys.stdout.flush()
+        shown.append(row)
+    return shown
 
 
 _AUTHORS = "authors' code, by 2026-11-21, processor not kept"

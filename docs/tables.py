@@ -493,6 +493,36 @@ def sketch() -> str:
     return markdown(["system", "width", "exact", "sketch", "ratio", "p"], rows)
 
 
+def long_trials() -> str:
+    """Return times of a step and memory of long trials, at the first tenth and at the last."""
+    table, rows = read("scaling").query("against == 'tenth'"), []
+    for (trial, form, q, steps), part in table.groupby(
+        ["trial", "form", "parameters", "steps"], sort=False
+    ):
+        first, last = part.iloc[0], part.iloc[-1]
+        rows.append([f"{trial}, `{form}`", f"{q:,}", f"{steps:,}"])
+        times = first.step_us, last.step_us, part.step_us.min(), part.step_us.max()
+        rows[-1] += [f"{one:,.0f}" for one in times]
+        rows[-1] += [f"{first.peak:,.0f}", f"{last.peak:,.0f}", f"{last.rows:,.1f}"]
+    head = ["trial", "parameters", "steps", "first tenth [µs]", "last", "quickest", "slowest"]
+    return markdown([*head, "peak after a tenth [MiB]", "at the end", "record"], rows)
+
+
+def step_costs() -> str:
+    """Return the cost of a step by each size, with its exponent, and its 95 % interval."""
+    table, rows = read("scaling").query("against != 'tenth'"), []
+    for (against, form), part in table.groupby(["against", "form"], sort=False):
+        x, y = np.log(part["size"]), np.log(part.step_us)
+        found = stats.linregress(x, y)
+        half = stats.t.ppf(0.975, len(x) - 2) * found.stderr
+        last = (y.iloc[-1] - y.iloc[-2]) / (x.iloc[-1] - x.iloc[-2])
+        slopes = found.slope, found.slope - half, found.slope + half, last
+        fitted, low, high, end = (f"{round(one, 2) + 0.0:.2f}" for one in slopes)
+        words = [f"{row['size']:,}: {row.step_us:,.0f}" for _, row in part.iterrows()]
+        rows.append([str(against), f"`{form}`", "; ".join(words), f"{fitted} [{low}, {high}]", end])
+    return markdown(["size", "form", "step [µs]", "exponent", "of the last two"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     made.__name__: made
     for made in (
@@ -501,7 +531,7 @@ TABLES: dict[str, Callable[[], str]] = {
         periodic, models,
         unknown_gain, integrators, integrators_gauss_newton, calibration, limits, noisy_angle,
         noisy_angle_expected, flex_table1, flex_table1_agents, flex_table3, flex_star,
-        active_sysid, flex_example, mujoco, sketch,
+        active_sysid, flex_example, mujoco, sketch, long_trials, step_costs,
     )
 }  # fmt: skip
 TABLES |= code_tables.TABLES

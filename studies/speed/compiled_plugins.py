@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from benchmarks.rows import Row
+from benchmarks.rows import Row, show
 from benchmarks.trials import cartpole, cost, run_in_turn
 from dopt.kernel.model import write_network_gradients
 from dopt.kernel.plugin import (
@@ -29,7 +29,6 @@ from dopt.policies import InformationPolicy
 from dopt.policies.base import CompiledPolicy
 from dopt.spec.trial import TrialSpec
 from dopt.types import Vector
-from studies.speed import show
 
 
 @dataclass(frozen=True, kw_only=True)
