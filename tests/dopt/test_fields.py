@@ -38,7 +38,7 @@ gamma dt horizon grid_half_widths grid_points state_limit mass length cart_mass 
 mass_2 length_1 length_2 inertia half_span width depth learning_rate window epsilon ensemble
 lookahead candidates starts n_features lengthscale amplitude regularization sketch_size hold
 iterations frequency band subspace count radius stride plans elites samples n_links n_pendulums
-time_constant capacity refit_every replan_every members refresh_every batch steps noise_variance
+time_constant capacity replan_every members refresh_every batch steps noise_variance
 forgetting dry_rate motor_gain measurement_noise velocity_cutoff core period front rear slip_speed
 motor steering steering_time inertia_z propeller_torque slow_speed slow_rate warm_up updates units
 fit_updates actors episodes entropy_weight first_rows growth
@@ -47,7 +47,7 @@ POSITIVE = set(POSITIVE_NAMES.split())
 NONNEGATIVE_NAMES = """
 weight measured_states discount noise gain gravity friction pivot_friction cart_friction drag
 beta_1 beta_2 stiffness damping budget_us final_friction underweighting dry_friction coupling
-strength orbit spread front_grip rear_grip turn_drag
+strength orbit spread front_grip rear_grip turn_drag refit_every
 """
 NONNEGATIVE = set(NONNEGATIVE_NAMES.split())
 FRACTIONS = {"beta_1", "beta_2", "discount"}
@@ -145,6 +145,7 @@ def test_the_default_is_accepted_as_a_list_or_a_tuple(section: str) -> None:
     ("section", "name", "field", "value", "words"),
     [
         ("learner", "ekf", "forgetting", 1.5, "above 0 and at most 1"),
+        ("learner", "joint_ekf", "refit_every", 0, "from 1 to 2147483647"),
         ("learner", "adam", "beta_1", 1.0, "at least 0 and below 1"),
         ("env", "pendulum", "noise", -1.0, "finite and at least 0"),
         ("env", "pendulum", "horizon", 0, "from 1 to 2147483647"),
