@@ -265,7 +265,7 @@ def test_an_agent_is_a_policy_of_a_launch(
     assert launch.main() == 0
     capsys.readouterr()
     assert orchestrate.main(["status", "--db", url]) == 0
-    assert policy in capsys.readouterr().out
+    assert policy.replace("_", " ") in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("word", ["policy=beyond/sac", "experiment=flex_table1_agents"])
