@@ -258,7 +258,7 @@ class Explorer(SavedExplored):
         self._fits: FitBeside | None = None
         if isinstance(spec.learner, SimulationError):
             self._fits = FitBeside(first_simulation())
-        elif isinstance(spec.learner, GaussNewton) and not spec.learner.refit_every:
+        elif isinstance(spec.learner, GaussNewton) and spec.learner.fits_beside:
             self._fits = FitBeside(self._state.fit_request())
         elif self._state.steps.evidence is not None:
             self._fits = FitBeside(first_evidence())

@@ -437,11 +437,12 @@ class SavedExplored(Explored):
 
     @contextmanager
     def _timed(self, row: int) -> Iterator[None]:
-        """Note how long a call of :meth:`ask`, or of :meth:`tell`, takes in this step."""
+        """Note how long a call of :meth:`ask`, or of :meth:`tell`, takes; the longest of a step."""
         t, began = self.n_steps, time.perf_counter()
         yield
         if t < self._times.shape[1]:
-            self._times[row, t] = 1e6 * (time.perf_counter() - began)
+            taken = 1e6 * (time.perf_counter() - began)
+            self._times[row, t] = np.fmax(self._times[row, t], taken)  # the first one is NaN
 
     def _tested(self, test: object, n: int, parameters: Array) -> Assessment:
         if not isinstance(test, tuple | list) or len(test) != 2:

@@ -367,7 +367,7 @@ class ExplorerState:
             fits = isinstance(learner, SimulationError | GaussNewton)
             sizes = len(self.steps.parameters), len(self.system.parameters) + 2
             if isinstance(learner, GaussNewton):
-                sizes = len(self.steps.parameters), 0
+                fits, sizes = learner.fits_beside, (len(self.steps.parameters), 0)
             elif evidence is not None:
                 fits, sizes = True, (evidence.numbers.size, 0)
             whole &= fits and (len(event["refit"]), len(event["fitted"])) == sizes

@@ -249,6 +249,11 @@ class GaussNewton(InformationLearner):
     steps: int = parameter(1, "steps", "positive")
     overshoot: str = parameter("stay", choices=("stay", "damp"), added=True)
 
+    @property
+    def fits_beside(self) -> bool:
+        """Whether a process beside an exploration fits, and steps do not."""
+        return self.refit_every == 0
+
     def samples_kept(self, horizon: int) -> int:
         return min(self.capacity, horizon)
 

@@ -48,7 +48,7 @@ FLOOR = 3.0
 LEAST = 0.1
 """Share of its scale that an unknown parameter is at the least, where torques are linearised.
 
-Where a centre or a friction is 0, its error does not depend on that of the mass or gear times it.
+Where a centre or a friction is 0, the error of the mass or gear that multiplies it does not count.
 """
 
 FRICTION = "damping,frictionloss"

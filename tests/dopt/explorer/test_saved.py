@@ -74,6 +74,11 @@ def test_what_ask_and_tell_took_is_stored(url: str, run: Explorer) -> None:
     assert times.shape == (10, 2)
     assert (times > 0.1).all()
     assert times.sum() < whole
+    t, x = run.n_steps, run.states[-1]
+    run.ask(x)
+    planned = run._times[0, t]
+    run.ask(x)  # the same answer, which takes less
+    assert run._times[0, t] >= planned
 
 
 def test_an_exploration_lives_between_two_saves(
