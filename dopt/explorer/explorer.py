@@ -260,8 +260,8 @@ class Explorer(SavedExplored):
             self._fits = FitBeside(first_simulation())
         elif isinstance(spec.learner, GaussNewton) and spec.learner.fits_beside:
             self._fits = FitBeside(self._state.fit_request())
-        elif self._state.steps.evidence is not None:
-            self._fits = FitBeside(first_evidence())
+        elif (evidence := self._state.steps.evidence) is not None:
+            self._fits = FitBeside(first_evidence(), evidence.first_request())
         self._waits = deadline is None
         if self._journal is not None:
             self._resume(self._journal)
@@ -404,10 +404,16 @@ class Explorer(SavedExplored):
         if fits.is_ready or (fits.is_running and self._waits and rows >= due):
             found = fits.take()
             if isinstance(found, str):
-                _log.warning("no fit to %d rows came into force: %s", fits.rows, found)
-            else:
-                self._note(state.refitted(found, fits.rows))
-        if not fits.is_running and rows >= due and self.n_steps < self.spec.system.horizon:
+                _log.warning("no fit to %d rows came from the process: %s", fits.rows, found)
+            if state.renewal is not None:
+                self._note({"renewed": fits.rows})  # which makes it where the process has failed
+            elif not isinstance(found, str):
+                self._note(state.refitted(found, fits.rows, beside=not self._waits))
+        if fits.is_running or self.n_steps == self.spec.system.horizon:
+            return
+        if (renewal := state.renewal) is not None:
+            fits.begin(renewal.request(), state.run.fitted, renewal.install)
+        elif rows >= due:
             fits.begin(state.fit_request(), rows)
 
     def _elapsed(self, now: float | None) -> float:

@@ -14,7 +14,7 @@ from dopt.errors import SpecificationError
 from dopt.explorer.refit import Found
 from dopt.fitting.fit import fit
 from dopt.kernel import learners
-from dopt.kernel.evidence import Request, fit_rows
+from dopt.kernel.evidence import Request, Samples, fit_rows, renewed
 from dopt.log import Log
 from dopt.systems.plant import Plant
 from dopt.types import Array
@@ -27,10 +27,12 @@ MOST_STEPS = 50
 """Steps of a fit of a network to its samples."""
 
 
-def _answer(request: Any) -> Found | Array:
+def _answer(request: Any) -> Found | Array | Samples:
     """Return what a fit finds, for a :data:`dopt.explorer.refit.FitRequest`."""
     if isinstance(request, Request):
         return fit_rows(request)
+    if isinstance(request[0], Samples):
+        return renewed(*request)
     if isinstance(request[0], Plant):
         return _found(*request)
     problem: learners.Problem = request[0]
@@ -52,6 +54,7 @@ def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
 def serve() -> None:
     """Answer requests from the standard input until it ends."""
     with contextlib.suppress(AttributeError, OSError):  # which Windows lacks
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # also where that is urgent
         os.nice(10)  # the exploration comes first
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed does not mix with them
@@ -61,7 +64,7 @@ def serve() -> None:
         except EOFError:
             return
         try:
-            answer: Found | Array | str = _answer(request)
+            answer: Found | Array | Samples | str = _answer(request)
         except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
             answer = str(error)
         try:

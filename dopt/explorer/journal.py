@@ -241,6 +241,7 @@ _ENTRIES = {
     "lost": ("lost",),
     "counted": ("counted",),
     "refit": ("refit", "fitted", "rows"),
+    "renewed": ("renewed",),
 }
 _NAMES = {"lost": ("unusable", "resets"), "counted": ("repeated", "out_of_order")}
 _INPUTS = ("applied", "plan", "missed")
@@ -257,7 +258,7 @@ def is_event(event: Event, n_states: int, n_inputs: int) -> bool:
                 return event[entry] in _NAMES[entry]
             if entry == "dt":
                 within(entry, event[entry], math.inf)
-            elif entry == "rows":
+            elif entry in ("rows", "renewed"):
                 whole(entry, event[entry], 1)
             elif entry in ("refit", "fitted"):
                 finite(entry, event[entry], np.size(event[entry]))

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,12 +29,13 @@ from dopt.systems.plant import Plant, unknown
 from dopt.types import Array
 
 if TYPE_CHECKING:
-    from dopt.kernel.evidence import Request  # which loads the compiler
+    from dopt.kernel.evidence import Request, Samples  # which loads the compiler
     from dopt.kernel.learners import Problem
 
-    FitRequest = tuple[Plant, Log, int, int] | Request | tuple[Problem, Array]
-    """What a fit is given: plant, log, units of the network, seed; samples of processes; or a
-    network with its samples, and the parameters to begin with."""
+    FitRequest = tuple[Plant, Log, int, int] | Request | tuple[Samples | Problem, Array]
+    """What a fit is given: plant, log, units of the network, seed; samples of processes, or these
+    with the numbers that they are to have; or a network with its samples, and the parameters to
+    begin with."""
 
 
 class Recording:
@@ -170,13 +172,14 @@ class FitBeside:
         Rows of the log that was given last.
     """
 
-    def __init__(self, first: FitRequest) -> None:
+    def __init__(self, *first: FitRequest) -> None:
         self.rows = 0
         self._thread = ThreadPoolExecutor(1, "fit")
         self._starting, self._is_closed = threading.Lock(), False
         self._process: subprocess.Popen[bytes] | None = None
-        self._answer: Future[Found | Array | str] | None = None
-        self._thread.submit(self._ask, first)  # compiled before the first fit is due
+        self._answer: Future[Any] | None = None
+        for request in first:  # compiled before the first fit is due
+            self._thread.submit(self._ask, request)
 
     @property
     def is_running(self) -> bool:
@@ -186,18 +189,20 @@ class FitBeside:
     def is_ready(self) -> bool:
         return self._answer is not None and self._answer.done()
 
-    def begin(self, request: FitRequest, rows: int) -> None:
-        """Begin a fit to so many rows."""
+    def begin(
+        self, request: FitRequest, rows: int, then: Callable[[Any], None] | None = None
+    ) -> None:
+        """Begin a fit to so many rows, after which another thread does something with it."""
         self.rows = rows
-        self._answer = self._thread.submit(self._ask, request)
+        self._answer = self._thread.submit(self._ask, request, then)
 
-    def take(self) -> Found | Array | str:
+    def take(self) -> Any:
         """Wait for what the fit has found, or for the sentence that says why there is nothing."""
         assert self._answer is not None
         answer, self._answer = self._answer, None
         return answer.result()
 
-    def _ask(self, request: FitRequest) -> Found | Array | str:
+    def _ask(self, request: FitRequest, then: Callable[[Any], None] | None = None) -> Any:
         with self._starting:
             if self._is_closed:
                 return "the exploration is closed"
@@ -209,10 +214,12 @@ class FitBeside:
         try:
             pickle.dump(request, self._process.stdin)
             self._process.stdin.flush()
-            answer: Found | Array | str = pickle.load(self._process.stdout)  # of our own process
+            answer = pickle.load(self._process.stdout)  # of our own process
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             _end(self._process)
             return f"its process has ended ({type(error).__name__}); another one begins"
+        if then is not None and not isinstance(answer, str):
+            then(answer)
         return answer
 
     def close(self) -> None:

@@ -13,7 +13,9 @@ event                   meaning
 ``lost``                a state that could not be used, after which the present one is unknown
 ``counted``             something that changes nothing, by the name of its count
 ``refit``, ``fitted``,  parameters of the model, and values of the constants, delay and lag, that
-``rows``                a fit to so many rows has found
+``rows``, ``beside``    a fit to so many rows has found; where it is so, the posterior of Gaussian
+                        processes with them is made beside the one in force
+``renewed``             that posterior, with the samples since, comes into force
 ======================  =====================================================================
 
 Events are in the units of the plant; the steps are taken in scaled numbers
@@ -54,6 +56,7 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     from dopt.explorer.refit import FitRequest
+    from dopt.kernel.evidence import Renewal
     from dopt.kernel.run import KernelSteps  # which loads the compiler
     from dopt.kernel.structs import Trial
     from dopt.reference.batch import ReferenceSteps
@@ -305,6 +308,8 @@ class ExplorerState:
             self.present = self.answer = self.time = None
         elif "refit" in event:
             self._refit(event)
+        elif "renewed" in event:
+            self._renew()
         else:
             self.counts[event["counted"]] += 1
 
@@ -318,6 +323,11 @@ class ExplorerState:
         assert isinstance(self.spec.system, ExploredPlant)
         plant = self.spec.system.plant
         return plant, self.run.log(plant), self.spec.model.width, self.spec.seed
+
+    @property
+    def renewal(self) -> Renewal | None:
+        """The posterior that is being made beside the one in force."""
+        return self.steps.evidence.renewal if self.steps.evidence is not None else None
 
     @property
     def _trial(self) -> Trial:
@@ -334,19 +344,32 @@ class ExplorerState:
         kept = features[:, :n].copy(), targets[:, :n].copy()
         return Problem(trial.network, trial.state.prior, ridge, *kept), trial.state.theta.copy()
 
-    def refitted(self, found: Found | Array, rows: int) -> Event:
-        """Return the event of a fit to so many rows that comes into force."""
+    def refitted(self, found: Found | Array, rows: int, *, beside: bool) -> Event:
+        """Return the event of a fit to so many rows that comes into force, or is to be beside."""
         if isinstance(found, np.ndarray):
-            return {"refit": found.ravel().tolist(), "fitted": [], "rows": rows}
+            event = {"refit": found.ravel().tolist(), "fitted": [], "rows": rows}
+            return {**event, "beside": True} if beside and self.steps.evidence else event
         assert isinstance(self.spec.model, MLP)
         theta = found.parameters(self._scaled, self.spec.model.width, self.steps.parameters)
         return {"refit": theta.tolist(), "fitted": found.fitted, "rows": rows}
 
-    def _refit(self, event: Event) -> None:
+    def _renew(self) -> None:
+        evidence = self.steps.evidence
+        assert evidence is not None
+        assert evidence.renewal is not None
+        evidence.renewal.finish()
+        evidence.renewal = None
         self.counts["refits"] += 1
-        if self.steps.evidence is not None:
-            numbers = np.array(event["refit"]).reshape(self.steps.evidence.numbers.shape)
-            self.steps.evidence.take(numbers, event["rows"])
+
+    def _refit(self, event: Event) -> None:
+        evidence = self.steps.evidence
+        if evidence is not None and event.get("beside"):
+            evidence.begin_renewal(np.array(event["refit"]).reshape(evidence.numbers.shape))
+            return
+        self.counts["refits"] += 1
+        if evidence is not None:
+            numbers = np.array(event["refit"]).reshape(evidence.numbers.shape)
+            evidence.take(numbers, event["rows"])
             return
         if isinstance(self.spec.learner, GaussNewton):
             self.steps.replace(np.array(event["refit"]), self._trial.plant.parameters)
@@ -369,8 +392,9 @@ class ExplorerState:
             if isinstance(learner, GaussNewton):
                 fits, sizes = learner.fits_beside, (len(self.steps.parameters), 0)
             elif evidence is not None:
-                fits, sizes = True, (evidence.numbers.size, 0)
+                fits, sizes = self.renewal is None, (evidence.numbers.size, 0)
             whole &= fits and (len(event["refit"]), len(event["fitted"])) == sizes
+        whole &= "renewed" not in event or self.renewal is not None
         return whole and (follows or not needs_state)
 
     def replay(self, event: Event) -> None:
@@ -439,6 +463,8 @@ class ExplorerState:
         self._watch_size(t, x, u, dt)
         error = self._error(t, dt)
         finite = self.steps.take_in(t, dt)
+        if self.renewal is not None:
+            self.renewal.note()
         self.errors[t] = self.steps.errors[t] * self._unit if error is None else error
         estimated = self.steps.states[t + 1] * self._scaled.states
         self.states[t + 1] = estimated if self.spec.system.n_measured else x

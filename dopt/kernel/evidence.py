@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
-from dopt.kernel.gaussian_process import negative_evidence, refactor, thin
+from dopt.kernel.gaussian_process import add_sample, negative_evidence, refactor, thin
 from dopt.kernel.pointers import compiled_for, kind_of, path_of
-from dopt.kernel.structs import Evaluation, Trial
+from dopt.kernel.structs import Evaluation, Network, Posterior, Trial
 from dopt.learning import Conditioning
 from dopt.models.base import Model
 from dopt.models.gaussian_process import ROUNDING, GaussianProcess, kernel
@@ -208,6 +208,113 @@ def is_tuned(model: Model) -> TypeGuard[GaussianProcess]:
     return isinstance(model, GaussianProcess) and model.is_tuned
 
 
+class Samples(NamedTuple):
+    """Samples of a process, with its parameters and its factors."""
+
+    network: Network
+    theta: Array
+    posterior: Posterior
+
+    def call(self, function: CompiledFunction, *more: Array) -> Any:
+        """Call a compiled function of them."""
+        kinds = tuple(map(kind_of, (*self, *more)))
+        return compiled_for(path_of(function), function, kinds)(*self, *more)
+
+    def copied(self) -> Samples:
+        """Return a copy, whose factors are to begin where those in force do not."""
+        network, theta, posterior = self
+        n_samples = network.process.n_samples.copy()
+        other = Posterior(posterior.factors, *(part.copy() for part in posterior[1:]))
+        other.first[0] = len(posterior.factors) // 2 - posterior.first[0]
+        process = network.process._replace(n_samples=n_samples)
+        return Samples(network._replace(process=process), theta.copy(), other)
+
+    def replace(self, other: Samples) -> None:
+        """Take over all but the factors."""
+        own, others = (
+            (one.network.process.n_samples, one.theta, *one.posterior[1:]) for one in (self, other)
+        )
+        for array, values in zip(own, others, strict=True):
+            array[:] = values
+
+    def renumber(self, numbers: Array) -> None:
+        """Thin the samples, and write the factors and the mean for other numbers, (r, 2p + 3).
+
+        The present ones stay where rounding leaves K + νI indefinite with the new ones.
+        """
+        self.call(thin)
+        present = self.theta[-numbers.size :].reshape(numbers.shape)
+        before = present.copy()
+        present[:] = numbers
+        if not self.call(refactor):
+            present[:] = before
+            self.call(refactor)
+
+
+def renewed(samples: Samples, numbers: Array) -> Samples:
+    """Return samples that have no factors with other numbers, (r, 2p + 3), and factors, (G, n, n).
+
+    These begin at 0.
+    """
+    n, first = samples.network.process.n_samples, np.zeros(1, dtype=np.int64)
+    factors = np.zeros((len(numbers), n[0], n[0]))
+    posterior = samples.posterior._replace(factors=factors, first=first)
+    samples = samples._replace(posterior=posterior)
+    samples.renumber(numbers)
+    kept = posterior._replace(factors=factors[:, : n[0], : n[0]])
+    return samples._replace(posterior=kept)
+
+
+class Renewal:
+    """A posterior with other numbers that is made beside the one in force.
+
+    It has the samples as they were when it began, thinned, and those since.
+
+    Parameters
+    ----------
+    present : Samples
+        Those in force, in whose unused factors it writes.
+    numbers : (r, 2p + 3)
+    """
+
+    def __init__(self, present: Samples, numbers: Array) -> None:
+        self._present, self._samples, self._numbers = present, present.copied(), numbers
+        self._since: list[tuple[Array, Array]] = []  # states, (d,), and accelerations, (r,)
+        self._added, self._is_made = 0, False
+
+    def note(self) -> None:
+        """Take in the newest sample of those in force."""
+        newest = self._present.posterior.newest_state, self._present.posterior.newest_target
+        self._since.append((newest[0].copy(), newest[1].copy()))
+
+    def request(self) -> tuple[Samples, Array]:
+        """Return what :func:`renewed` is given."""
+        posterior = self._samples.posterior._replace(factors=np.zeros((0, 0, 0)))
+        return self._samples._replace(posterior=posterior), self._numbers
+
+    def install(self, made: Samples) -> None:
+        """Take what another process has made, and add the samples since; in any thread."""
+        own, factors = self._samples.posterior, made.posterior.factors
+        first, (G, n, _) = own.first.copy(), factors.shape
+        np.copyto(own.factors[first[0] : first[0] + G, :n, :n], factors)
+        self._samples.replace(made)
+        own.first[:] = first
+        self._is_made = True
+        self._add_those_since()
+
+    def finish(self) -> None:
+        """Do what is left, and let it come into force."""
+        if not self._is_made:
+            self._samples.renumber(self._numbers)
+        self._add_those_since()
+        self._present.replace(self._samples)
+
+    def _add_those_since(self) -> None:
+        while self._added < len(self._since):
+            self._samples.call(add_sample, *self._since[self._added])
+            self._added += 1
+
+
 class Evidence:
     """The fits of one trial.
 
@@ -217,12 +324,16 @@ class Evidence:
         Number of steps after which the next fit is due.
     numbers : (r, 2p + 3)
         Numbers of the kernels, a view of the parameters.
+    renewal : Renewal or None
+        Samples with the numbers of the last fit, until they come into force.
     """
 
     def __init__(self, spec: TrialSpec, trial: Trial) -> None:
         assert isinstance(spec.learner, Conditioning)
         assert isinstance(spec.model, GaussianProcess)
-        self._trial, self._learner = trial, spec.learner
+        self._samples = Samples(trial.network, trial.state.theta, trial.state.posterior)
+        self._learner = spec.learner
+        self.renewal: Renewal | None = None
         self._noise = spec.model.known_noise(spec.system)
         r, size = spec.system.n_learned, 2 * len(spec.system.features) + 3
         self.numbers = trial.state.theta[-r * size :].reshape(r, size)
@@ -231,36 +342,36 @@ class Evidence:
 
     def request(self) -> Request:
         """Return what the next fit needs: a copy, and the samples go on."""
-        network, state = self._trial.network, self._trial.state
+        network, theta, posterior = self._samples
         n = int(network.process.n_samples[0])
         p = network.sizes[0]
         chosen = evenly(n, MOST_FITTED)
-        phi = state.theta[: p * network.process.room].reshape(p, -1)[:, chosen]
-        targets, starts = state.posterior.targets[:, chosen], self.numbers[:, None].copy()
+        phi = theta[: p * network.process.room].reshape(p, -1)[:, chosen]
+        targets, starts = posterior.targets[:, chosen], self.numbers[:, None].copy()
         if self._done < FITS_WITH_RESTARTS:
             guesses = np.array([guessed(phi, y) for y in targets])[:, None]
             drawn = guesses * np.exp(self._normals[self._done][:, None])
             starts = np.concatenate([*([starts] if self._done else []), guesses, drawn], axis=1)
-        return Request(phi, targets, state.posterior.counts[chosen], starts, self._noise)
+        return Request(phi, targets, posterior.counts[chosen], starts, self._noise)
 
     def take(self, numbers: Array, steps: int) -> None:
-        """Let the numbers of a fit after so many steps come into force.
-
-        The present ones stay where rounding leaves K + νI indefinite with the new ones.
-        """
-        self._call(thin)
-        before = self.numbers.copy()
-        self.numbers[:] = numbers
-        if not self._call(refactor):
-            self.numbers[:] = before
-            self._call(refactor)
+        """Let the numbers of a fit after so many steps come into force."""
+        self._samples.renumber(numbers)
         self._done += 1
         self.due = self._learner.next_fit(steps)
 
-    def _call(self, function: CompiledFunction) -> Any:
-        network, state = self._trial.network, self._trial.state
-        given = network, state.theta, state.posterior
-        return compiled_for(path_of(function), function, tuple(map(kind_of, given)))(*given)
+    def begin_renewal(self, numbers: Array) -> None:
+        """Let a posterior with the numbers of a fit be made, and the present one go on."""
+        self.renewal = Renewal(self._samples, numbers)
+        self._done += 1
+
+    def first_request(self) -> tuple[Samples, Array]:
+        """Return a small request, and load the code that a renewal needs here."""
+        small = Renewal(self._samples, self.numbers)
+        request = small.request()
+        small.note()
+        small.install(renewed(*request))
+        return request
 
     def fit(self, points: Evaluation) -> float:
         """Fit the kernels, with as many samples as were due; return the time that it took [µs]."""

@@ -235,8 +235,15 @@ def _posterior(spec: TrialSpec) -> args.Posterior:
     room, kernels, r = 0, 0, spec.system.n_learned
     if isinstance(spec.model, GaussianProcess):
         room, kernels = spec.model.room(spec.system), r if spec.model.is_tuned else 1
-    factors = np.zeros((kernels, room, room))
-    return args.Posterior(factors, np.zeros((r, room)), np.zeros((r, room)), np.zeros(room))
+    return args.Posterior(
+        np.zeros((2 * kernels, room, room)),  # what nothing is written to takes no memory
+        np.zeros((r, room)),
+        np.zeros((r, room)),
+        np.zeros(room),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(spec.system.n_states),
+        np.zeros(r),
+    )
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:

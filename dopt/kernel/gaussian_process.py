@@ -108,6 +108,13 @@ def write_kernel(numbers: Vector, phi: Vector, others: Matrix, first: int, out: 
 
 
 @compiled
+def factor_of(posterior: Posterior, g: int) -> Matrix:
+    """Return a view of the factor of a kernel that is in force, (C, C)."""
+    factor: Matrix = posterior.factors[posterior.first[0] + g]
+    return factor
+
+
+@compiled
 def prior_variance(numbers: Vector, phi: Vector) -> float:
     """Return the kernel at features (p,)."""
     p = phi.shape[0]
@@ -148,7 +155,7 @@ def write_means(network: Network, theta: Vector, states: Matrix, outputs: Matrix
         outputs[:, i] = value
 
 
-@compiled
+@called_from_python
 def add_sample(
     network: Network, theta: Vector, posterior: Posterior, x: Vector, target: Vector
 ) -> None:
@@ -164,7 +171,7 @@ def add_sample(
         return
     numbers, others, added = numbers_of(network, theta, r), sample_features(network, theta), 0.0
     for g in range(numbers.shape[0]):
-        factor = posterior.factors[g]
+        factor = factor_of(posterior, g)
         row = factor[n, :n]
         write_kernel(numbers[g], phi, others, 0, row)
         solve_lower(factor, n, factor[n : n + 1])
@@ -183,7 +190,7 @@ def add_sample(
         others[j, n] = phi[j]
     network.process.n_samples[0] = n + 1
     for k in range(r):
-        factor = posterior.factors[k % numbers.shape[0]]
+        factor = factor_of(posterior, k % numbers.shape[0])
         known = inner(factor[n, :n], posterior.solved[k, :n])
         posterior.solved[k, n] = (target[k] - known) / factor[n, n]
     _write_weights(network, theta, posterior, r)
@@ -295,12 +302,12 @@ def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
 def _write_weights(network: Network, theta: Vector, posterior: Posterior, r: int) -> None:
     """Write α of all rows."""
     n, alpha = network.process.n_samples[0], mean_weights(network, theta, r)
-    G = posterior.factors.shape[0]
+    G = numbers_of(network, theta, r).shape[0]
     for g in range(G):
         columns = np.empty(((r + G - 1 - g) // G, n))
         for i in range(columns.shape[0]):
             copy_into(posterior.solved[g + i * G, :n], columns[i])
-        solve_lower_transposed(posterior.factors[g], n, columns)
+        solve_lower_transposed(factor_of(posterior, g), n, columns)
         for i in range(columns.shape[0]):
             copy_into(columns[i], alpha[g + i * G, :n])
 
@@ -318,10 +325,11 @@ def refactor(network: Network, theta: Vector, posterior: Posterior) -> bool:
         _write_covariance(numbers[g], phi, posterior.counts[:n], K, K)
         definite = factorize(K) and definite
         for i in range(n):
-            copy_into(K[i, : i + 1], posterior.factors[g, i, : i + 1])
+            copy_into(K[i, : i + 1], factor_of(posterior, g)[i, : i + 1])
     for k in range(r):
         copy_into(posterior.targets[k, :n], posterior.solved[k, :n])
-        solve_lower(posterior.factors[k % numbers.shape[0]], n, posterior.solved[k : k + 1])
+        factor = factor_of(posterior, k % numbers.shape[0])
+        solve_lower(factor, n, posterior.solved[k : k + 1])
     _write_weights(network, theta, posterior, r)
     return definite
 
@@ -401,7 +409,7 @@ def whitened(
     for i in range(N):
         write_kernel(numbers, phi[i], others, 0, rows[i])
     columns = rows.T.copy()
-    solve_columns(posterior.factors[g, :n, :n], columns)
+    solve_columns(factor_of(posterior, g)[:n, :n], columns)
     return columns.T.copy()
 
 

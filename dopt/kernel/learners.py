@@ -38,7 +38,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import DAMPINGS, NO_GROWTH, SMALLEST_SHARE, ModelKind
-from dopt.kernel.compiler import called_from_python, compiled, squared
+from dopt.kernel.compiler import called_from_python, compiled, copy_into, squared
 from dopt.kernel.gaussian_process import add_sample
 from dopt.kernel.linear_algebra import (
     append_row,
@@ -293,8 +293,10 @@ def whiten(
 @compiled
 def condition(trial: Trial, t: int, target: Vector) -> None:
     """Add the sample of step t, whose accelerations are (r,), to a Gaussian process."""
-    x = sampled_state(trial.plant, trial.record.states, t)
-    add_sample(trial.network, trial.state.theta, trial.state.posterior, x, target)
+    x, posterior = sampled_state(trial.plant, trial.record.states, t), trial.state.posterior
+    copy_into(x, posterior.newest_state)
+    copy_into(target, posterior.newest_target)
+    add_sample(trial.network, trial.state.theta, posterior, x, target)
 
 
 @compiled

@@ -79,10 +79,13 @@ class Posterior(NamedTuple):
     Empty in other models.
     """
 
-    factors: Stack  # (G, C, C), L of each kernel in the lower triangle
+    factors: Stack  # (2G, C, C), L of each kernel in the lower triangle, and room for others
     targets: Matrix  # (r, C)
     solved: Matrix  # (r, C), z
     counts: Vector  # (C,) observations of which each sample is the mean
+    first: Integers  # (1,) 0 or G, where the G factors in force begin
+    newest_state: Vector  # (d,) where the newest sample was taken
+    newest_target: Vector  # (r,)
 
 
 class Linearization(NamedTuple):

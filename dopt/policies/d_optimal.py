@@ -23,6 +23,9 @@ SMALL_PRIMAL = 600
 EQUAL_COST = 0.9
 """Parameters for each row of the whole trial at which primal and dual steps take the same time."""
 
+LARGEST_PRIMAL = 23_000
+"""Most parameters for which ``auto`` holds M⁻¹, which then has 4 GB, on any machine."""
+
 LARGE_DUAL = 4000
 _SKETCH_SEED = 1_406_2
 
@@ -64,13 +67,14 @@ class DOptimal(InformationPolicy):
         """Return the form for q parameters and N rows in the whole trial.
 
         The primal form costs about q² a step, the dual one about N²/3 on average over the trial;
-        they were measured to take the same time at q = 0.9 N.
+        they were measured to take the same time at q = 0.9 N. Either is refused where it is too
+        large for the memory of a usual machine.
         """
         if self.form != "auto":
             return self.form
         if self.information == "fresh":
             return "primal"
-        if n_parameters <= max(SMALL_PRIMAL, EQUAL_COST * n_rows):
+        if n_parameters <= min(max(SMALL_PRIMAL, EQUAL_COST * n_rows), LARGEST_PRIMAL):
             return "primal"
         return "dual" if n_rows <= LARGE_DUAL else "sketch"
 

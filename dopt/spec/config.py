@@ -34,11 +34,13 @@ from dopt.policies import (
     policy_title,
 )
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolicy
+from dopt.policies.d_optimal import EQUAL_COST
 from dopt.registry import SOURCE, TARGET, added_defaults, identifying_section, section_of
 from dopt.spec.compatibility import (
     check_reference,
     check_sampled,
     check_together,
+    held_information,
     memory_by_setting,
     mismatch,
 )
@@ -103,12 +105,16 @@ REACHABLE_VERSION = 2
 PLAN_VERSION = 2
 """Version of linearized D-optimal plans for a model that is not affine in the inputs."""
 
+FORM_VERSION = 2
+"""Version of the form of M that ``auto`` takes where the cheapest one is too large."""
+
 _VERSIONS = (
     "code_version",
     "assessment_version",
     "criterion_version",
     "reachable_version",
     "plan_version",
+    "form_version",
 )
 
 LARGEST_HORIZON = 10_000_000
@@ -294,7 +300,18 @@ class TrialConfig:
             content["reachable_version"] = REACHABLE_VERSION
         if isinstance(self.policy, DOptimal) and not self.model.affine_in_inputs:
             content["plan_version"] = PLAN_VERSION
+        if self._leaves_primal():
+            content["form_version"] = FORM_VERSION
         return content
+
+    def _leaves_primal(self) -> bool:
+        """Return True if M is sketched because the primal form, the cheapest, is too large."""
+        system, policy, model, learner = self._parts
+        if not isinstance(policy, DOptimal) or policy.form != "auto":
+            return False
+        q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
+        held = held_information(policy, learner, q, n_rows)
+        return bool(held and held.form == "sketch" and q <= EQUAL_COST * n_rows)
 
     def _scales_criterion(self) -> bool:
         """Return True if plans are compared by a criterion that depends on ρ, and ρ is not 1."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +24,8 @@ from dopt.models.gaussian_process import kernel
 from dopt.policies import POLICIES, InformationPolicy
 from dopt.policies.base import CompiledPolicy
 from dopt.run import run_trial
+from dopt.spec.compatibility import held_information
+from dopt.spec.config import FORM_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.dopt.custom_networks import model_of_one
@@ -207,6 +210,23 @@ def test_a_wide_network_holds_it_in_the_primal_form() -> None:
     wide = trial("arm", "d_optimal", policy=FRESH, model={"width": 64})
     assert wide.policy.chosen_form(10_000, 60) == "primal"  # type: ignore[attr-defined]
     assert trial("arm", "d_optimal").policy.chosen_form(10_000, 60) == "dual"  # type: ignore[attr-defined]
+
+
+def test_auto_takes_no_form_that_is_too_large_and_the_key_says_so() -> None:
+    """Where the cheapest form fits the key stays."""
+    for width, form, version in ((64, "primal", None), (256, "sketch", FORM_VERSION)):
+        given: dict[str, Any] = {"env": {"horizon": 100_000}, "model": {"width": width}}
+        spec = trial("cartpole", "d_optimal", **given)
+        q = spec.model.n_member_parameters(spec.system)
+        held = held_information(spec.policy, spec.learner, q, 200_000)
+        assert held is not None
+        assert held.form == form
+        assert json.loads(spec.config_json).get("form_version") == version
+        assert spec.config.memory < 2**30
+        told = trial("cartpole", "d_optimal", policy={"form": "primal"}, **given)
+        assert "form_version" not in told.config_json
+    wide = trial("cartpole", "d_optimal", env={"horizon": 1000}, model={"width": 256})
+    assert "form_version" not in wide.config_json  # in the dual form, as before
 
 
 def own(**fields: object) -> TrialSpec:
