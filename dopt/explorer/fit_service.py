@@ -68,7 +68,7 @@ def serve() -> None:
         except (SpecificationError, ArithmeticError, np.linalg.LinAlgError) as error:
             answer = str(error)
         try:
-            pickle.dump(answer, answers)
+            pickle.dump(answer, answers, protocol=5)  # whose arrays are read without a copy
             answers.flush()
         except BrokenPipeError:  # the exploration has ended
             os._exit(0)  # without another attempt to flush

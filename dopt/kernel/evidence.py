@@ -261,8 +261,8 @@ def renewed(samples: Samples, numbers: Array) -> Samples:
     posterior = samples.posterior._replace(factors=factors, first=first)
     samples = samples._replace(posterior=posterior)
     samples.renumber(numbers)
-    kept = posterior._replace(factors=factors[:, : n[0], : n[0]])
-    return samples._replace(posterior=kept)
+    kept = np.ascontiguousarray(factors[:, : n[0], : n[0]])
+    return samples._replace(posterior=posterior._replace(factors=kept))
 
 
 class Renewal:
