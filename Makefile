@@ -80,10 +80,10 @@ coverage: setup  ## run the test suite and require that 90 % of the lines are ru
 
 test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
-	$(BIN)/python -m pytest --numprocesses 2 -m machines tests/machines
+	$(BIN)/python -m pytest --numprocesses 3 -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
-	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} $(BIN)/python -m pytest -m soak tests/soak
+	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} $(BIN)/python -m pytest --numprocesses 3 -m soak tests/soak
 
 image: setup  ## build the image and run its services (root on Debian)
 	.ci/image
