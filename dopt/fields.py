@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import math
 import re
@@ -158,16 +159,12 @@ class _Kind(NamedTuple):
     optional: bool = False
 
 
+@functools.cache
 def _kinds(cls: type[Validated]) -> dict[str, _Kind]:
     """Return what the fields of a class hold, read once from their annotations."""
-    if cls not in _known:
-        check_own_fields(cls)
-        fields = [f for f in dataclasses.fields(cls) if f.metadata.get("validated", True)]
-        _known[cls] = {field.name: _kind(cls, field) for field in fields}
-    return _known[cls]
-
-
-_known: dict[type, dict[str, _Kind]] = {}
+    check_own_fields(cls)
+    fields = [f for f in dataclasses.fields(cls) if f.metadata.get("validated", True)]
+    return {field.name: _kind(cls, field) for field in fields}
 
 
 def _kind(cls: type[Validated], field: dataclasses.Field[Any]) -> _Kind:
@@ -188,8 +185,9 @@ def _kind(cls: type[Validated], field: dataclasses.Field[Any]) -> _Kind:
     )
     entries = {float} if entries == {int, float} else entries
     if len(entries) != 1 or not entries <= {int, float, str}:
+        shown = annotation.__name__ if isinstance(annotation, type) else annotation
         raise SpecificationError(
-            f"{cls._path(field.name)} of {cls.__name__} is annotated as {_shown(annotation)}, but "
+            f"{cls._path(field.name)} of {cls.__name__} is annotated as {shown}, but "
             f"int, float, str, a tuple of one of them, or one of these with '| None' is "
             f"expected: change the annotation."
         )
@@ -219,10 +217,6 @@ def _annotation(cls: type[Validated], field: dataclasses.Field[Any]) -> Any:
 
 
 _ANNOTATIONS = "__annotations__"
-
-
-def _shown(annotation: object) -> str:
-    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
 
 
 def _converted(path: str, field: dataclasses.Field[Any], kind: _Kind, value: object) -> object:

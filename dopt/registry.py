@@ -11,6 +11,7 @@ import ast
 import codecs
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib.util
 import inspect
@@ -71,7 +72,10 @@ def section_of(item: Validated) -> dict[str, object]:
         return item.to_section()
     fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
     listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
-    return {"name": getattr(item, "name", None), **_origin(type(item)), **listed}
+    cls, origin = type(item), dict[str, object]()
+    if cls.__module__.partition(".")[0] != __name__.partition(".")[0]:  # of the user's own
+        origin = {TARGET: _target(cls), SOURCE: source_digest(cls)}
+    return {"name": getattr(item, "name", None), **origin, **listed}
 
 
 def identifying_section(item: Validated) -> dict[str, object]:
@@ -124,7 +128,8 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
 
 def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any) -> type[T]:
     """Return a class of the user's own that fits into a section."""
-    wanted = _base(next(iter(registry.values())))
+    shipped = next(iter(registry.values()))
+    wanted = next(base for base in shipped.__mro__ if "section" in base.__dict__)
     if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
         raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
     check_own_fields(cls)
@@ -157,11 +162,6 @@ def check_stored(config: Mapping[str, object]) -> None:
                 f"digest of the file is expected, as no unknown code is run: register the trial "
                 f"again with a launch of your own."
             )
-
-
-def _base(cls: type[Validated]) -> type[Validated]:
-    """Return the class that declares the section of a specification."""
-    return next(base for base in cls.__mro__ if "section" in base.__dict__)
 
 
 def imported(section: str, path: str, given: Mapping[str, object] | None = None) -> object:
@@ -273,13 +273,6 @@ def _unfit(section: str, path: str, expected: str) -> SpecificationError:
     )
 
 
-def _origin(cls: type[Validated]) -> dict[str, object]:
-    """Return what identifies a class of the user's own; nothing for one of this package."""
-    if cls.__module__.partition(".")[0] == __name__.partition(".")[0]:
-        return {}
-    return {TARGET: _target(cls), SOURCE: source_digest(cls)}
-
-
 def _target(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
@@ -298,6 +291,7 @@ _TYPED = ("__main__.", "builtins.")
 """Modules of what is typed into a notebook or a script, or executed as text."""
 
 
+@functools.cache
 def source_digest(cls: type) -> str:
     """Return the digest of the file that defines a class, as it was when first asked for.
 
@@ -308,9 +302,7 @@ def source_digest(cls: type) -> str:
     SpecificationError
         If the source cannot be read, as for a class typed into an interpreter.
     """
-    if cls not in _digests:
-        _digests[cls] = _digest(_source(cls))
-    return _digests[cls]
+    return _digest(_source(cls))
 
 
 def _digest(content: bytes) -> str:
@@ -342,9 +334,6 @@ def _cell(cls: type) -> str:
     return next((text for text in texts if re.search(rf"class {cls.__name__}\b", text)), "")
 
 
-_digests: dict[type, str] = {}
-
-
 def check_returned(whose: str, method: str, found: object, base: type) -> None:
     """Refuse what has not the methods of ``base``; ``whose`` names the class in a message.
 
@@ -357,23 +346,14 @@ def check_returned(whose: str, method: str, found: object, base: type) -> None:
     missing = [key for key in wanted if not callable(getattr(found, key, None))]
     if not missing and not isinstance(found, type):
         return
+    shown, remedy = "None", f"add the return statement to {method}()"
+    if isinstance(found, type):
+        shown = f"the class {found.__name__} itself"
+        remedy = f"return {found.__name__}(...), an object of it"
+    elif found is not None:
+        shown = f"an object of type {type(found).__name__}"
+        remedy = f"return one that has {', '.join(missing)}"
     raise SpecificationError(
-        f"{method}() of {whose} returned {_shown(found)}, but an object of a class derived from "
-        f"{base.__module__}.{base.__name__} is expected: {_remedy(found, method, missing)}."
+        f"{method}() of {whose} returned {shown}, but an object of a class derived from "
+        f"{base.__module__}.{base.__name__} is expected: {remedy}."
     )
-
-
-def _shown(found: object) -> str:
-    if found is None:
-        return "None"
-    if isinstance(found, type):
-        return f"the class {found.__name__} itself"
-    return f"an object of type {type(found).__name__}"
-
-
-def _remedy(found: object, method: str, missing: list[str]) -> str:
-    if found is None:
-        return f"add the return statement to {method}()"
-    if isinstance(found, type):
-        return f"return {found.__name__}(...), an object of it"
-    return f"return one that has {', '.join(missing)}"

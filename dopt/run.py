@@ -15,6 +15,7 @@ from dopt.assessment import assessed
 from dopt.errors import SpecificationError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from dopt.types import Array
 
 if TYPE_CHECKING:
     from dopt.kernel.run import KernelTrial, SteppedTrial  # which loads the compiler
@@ -57,9 +58,6 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     from dopt.kernel.run import run_trial_in_kernel
 
     return assessed(spec, run_trial_in_kernel(spec))
-
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.systems.base import System
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array
 
 
 class TrialView(ABC):

@@ -384,8 +384,10 @@ class Explorer(SavedExplored):
         elif not np.isfinite(state.accelerations(x, u, elapsed)).all():
             self._note({"lost": "unusable"})
         else:
-            if state.answer is None:
-                self._plan_unasked()
+            if state.answer is None and self._plans_each_step:  # though none was asked for
+                if not self._planner.plan():
+                    self._planner.wait()
+                self._note_plan(unasked=True)
             if now is None and state.time is not None:
                 now = state.time + dt
             event = {"learn": x.tolist(), "applied": u.tolist(), "dt": elapsed, "time": now}
@@ -457,13 +459,6 @@ class Explorer(SavedExplored):
             self._note_plan()
         if self._state.answer is None:
             self._note({"missed": self._fallback.tolist()}, durable=False)
-
-    def _plan_unasked(self) -> None:
-        """Let a policy that may remember its plans make one where none was asked for."""
-        if self._plans_each_step:
-            if not self._planner.plan():
-                self._planner.wait()
-            self._note_plan(unasked=True)
 
     def _note_plan(self, **more: bool) -> None:
         planned = self._state.planned

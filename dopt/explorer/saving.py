@@ -106,7 +106,7 @@ def free_run_error(
     measured states.
     """
     system = spec.system if system is None else system
-    y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
+    y, u = np.atleast_1d(reals("states", states)), np.atleast_1d(reals("inputs", inputs))
     steps = whole("steps", steps)
     rows = _rows_of(system, y)
     first = 0 if isinstance(rows, slice) else max(steps, 1)  # in which the filter settles
@@ -117,7 +117,13 @@ def free_run_error(
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
-    x = y if isinstance(rows, slice) else _estimated(spec, system, predict, y, u, rows)
+    x = y
+    if not isinstance(rows, slice):
+        found, learner = scaled(system), spec.learner
+        learner = learner if isinstance(learner, JointKalman) else JointKalman()
+        run = found.of_states(y, rows), found.of_inputs(u)
+        by_model = found.scaled_predictions(predict)
+        x = found.states * filtered_states(found.system, by_model, *run, learner.noise_variance)
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
     starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
@@ -128,21 +134,6 @@ def free_run_error(
         )
     predicted = forecast_by(system, predict)(x[first:last:steps], cut)
     return relative_error(predicted[..., rows], ends, starts)
-
-
-def _estimated(
-    spec: TrialSpec,
-    system: System,
-    predict: Callable[[Array, Array], Array],
-    outputs: Array,
-    inputs: Array,
-    rows: list[int],
-) -> Array:
-    """Return estimates of the states, (T + 1, d), of which some rows were measured."""
-    found, variance = scaled(system), _variance(spec)
-    y, u = found.of_states(outputs, rows), found.of_inputs(inputs)
-    predict = found.scaled_predictions(predict)
-    return found.states * filtered_states(found.system, predict, y, u, variance)
 
 
 def _rows_of(system: System, run: Array) -> slice | list[int]:
@@ -171,12 +162,6 @@ def _check_finite(run: Array, inputs: Array) -> None:
                 f"a run was given in which the {what} of row {bad[0]} are {rows[bad[0]].tolist()}, "
                 f"but finite numbers are expected: give a part of the run without such rows."
             )
-
-
-def _variance(spec: TrialSpec) -> float:
-    """Return ρ of the filter over the state: the learner's, or the default of joint_ekf."""
-    learner = spec.learner if isinstance(spec.learner, JointKalman) else JointKalman()
-    return learner.noise_variance
 
 
 # States, inputs, errors and predictions of an exploration so far.

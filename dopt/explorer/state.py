@@ -180,11 +180,6 @@ class PunctualPlanner:
             return False
         return True
 
-    @property
-    def is_late(self) -> bool:
-        """Whether a plan is still being made."""
-        return self._late is not None and not self._late.done()
-
     def wait(self) -> bool:
         """Wait for a plan that was not ready in time, and return whether there was one."""
         if self._late is None:

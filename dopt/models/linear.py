@@ -10,9 +10,9 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.fields import parameter
-from dopt.models.base import Array, Model
+from dopt.models.base import Model
 from dopt.systems.base import Feature, System
-from dopt.types import Scalar
+from dopt.types import Array, Scalar
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dopt.control.task import Feedback
 from dopt.custom_planner import custom_planner
@@ -34,7 +34,6 @@ from dopt.reference.models import (
     known_flow,
     model_function,
     model_states,
-    network_function,
     next_states,
     planning_columns,
     quadratic_problem,
@@ -52,8 +51,8 @@ from dopt.types import Array
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 
-class BatchState:
-    """n trials of one configuration in torch, before their first step.
+class BatchSteps:
+    """The steps of n trials in torch, whatever comes between them: a simulation or a measurement.
 
     Parameters
     ----------
@@ -61,9 +60,6 @@ class BatchState:
         Trials that differ in the seed alone.
     device : str
         Torch device, ``"cpu"`` or ``"cuda"``.
-    module : torch.nn.Module, optional
-        Network from features to accelerations in place of the registered model; its parameters at
-        the time of the call are the initial ones of every trial.
 
     Attributes
     ----------
@@ -79,6 +75,10 @@ class BatchState:
         M in the space to which ``project`` maps gradients, (..., q).
     diverged : (n, 1) tensor
         Whether a trial has ended.
+    planners : list of Planner
+        The plan of each trial where the policy is written in numpy.
+    learner : object
+        What takes the learning step of the batch.
     noise, open_loop, ties, components : tensors
         Numbers of :class:`dopt.randomness.Draws` with the trials along the first axis.
 
@@ -88,9 +88,7 @@ class BatchState:
         If the trials belong to different configurations.
     """
 
-    def __init__(
-        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-    ) -> None:
+    def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
         if len({spec.config_key for spec in specs}) != 1:
             raise SpecificationError(
                 f"{len(specs)} trials of different configurations were given, but the trials "
@@ -103,15 +101,21 @@ class BatchState:
         self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
         self.ties = self.tensor(np.stack([d.ties for d in draws]))
         self.components = torch.tensor(np.stack([d.components for d in draws]), device=device)
-        if module is None:
-            self.model: BatchModel = model_function(self.system, self.config.model)
-            self.theta = self.tensor(np.stack([d.weights for d in draws]))
-        else:
-            self.model = network_function(self.system, module)
-            flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
-            self.theta = flat.to(device).repeat(len(specs), 1)
+        self.model: BatchModel = model_function(self.system, self.config.model)
+        self.theta = self.tensor(np.stack([d.weights for d in draws]))
         self._allocate()
         self._hold_information()
+        plans = (custom_planner(spec) for spec in self.specs)
+        self.planners = [plan for plan in plans if plan is not None]
+        learner, policy = self.config.learner, self.config.policy
+        self.learner: AdamLearner | NumpyLearner | LeastSquaresLearner
+        if isinstance(learner, Adam):
+            self.learner = AdamLearner(learner, self)
+        elif isinstance(learner, CustomLearner):
+            self.learner = NumpyLearner(learner, self)
+        else:
+            ridge = getattr(policy, "regularization", getattr(learner, "regularization", 1.0))
+            self.learner = LeastSquaresLearner(float(ridge), self)
 
     def tensor(self, values: Array) -> Tensor:
         """Return real numbers as a tensor where the trials are."""
@@ -166,6 +170,51 @@ class BatchState:
             observed = observed - (step - self.model(self.theta, at.unsqueeze(1)).squeeze(1))
         self.targets[:, t] = observed
 
+    def plan(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
+        policy, system, x = self.config.policy, self.system, self.states[:, t]
+        if isinstance(policy, OpenLoop) or t == 0:
+            return self.open_loop[:, t]
+        if self.planners:
+            return self._planned_in_numpy(t)
+        if isinstance(policy, Uniform):
+            seen = self.states[:, : t + 1]
+            return uniform_inputs(system, self.model, self.theta, seen, policy.iterations)
+        assert self.information is not None
+        columns = planning_columns(system, self.model, self.theta, x, self.components[:, t])
+        problem = quadratic_problem(self.project(columns), self.information)
+        return d_optimal_inputs(problem, system.gamma, self.ties[:, t])
+
+    def _planned_in_numpy(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m), of the trials' own plans; diverged ones get a random one.
+
+        Raises
+        ------
+        SpecificationError
+            If an input has the wrong shape or a norm above γ.
+        """
+        inputs = self.open_loop[:, t].clone()
+        for i in self.alive():
+            chosen = np.asarray(self.planners[i].choose(BatchTrialView(self, i, t)), np.float64)
+            check_choice(self.config.policy.name, chosen, t, self.system)
+            inputs[i] = torch.as_tensor(chosen).to(inputs)
+        return inputs
+
+    def learn(self, t: int) -> None:
+        """Update the parameters with the samples up to step t; diverged trials keep theirs."""
+        before = self.theta.clone()
+        self.learner.learn(t)
+        self.theta.copy_(torch.where(self.diverged, before, self.theta))
+
+    def inform(self, t: int) -> None:
+        """Add JᵀJ at x_t and the parameters after the learning step of time t (equation 5)."""
+        for i in self.alive() if self.planners else ():
+            self.planners[i].observe(BatchTrialView(self, i, t + 1))
+        if self.information is not None:
+            x = self.sampled_states[:, t : t + 1]
+            J = jacobian(self.model, self.system.n_learned, self.theta, x)
+            self.information.add(self.project(J[:, 0]))
+
     def alive(self) -> list[int]:
         """Return the places of the trials that have not diverged."""
         return [i for i, ended in enumerate(self.diverged[:, 0].tolist()) if not ended]
@@ -174,7 +223,7 @@ class BatchState:
 class BatchTrialView(TrialView):
     """Trial ``index`` of a batch after t steps, for a plan or an update in numpy."""
 
-    def __init__(self, batch: BatchState, index: int, t: int) -> None:
+    def __init__(self, batch: BatchSteps, index: int, t: int) -> None:
         self.system, self.t = batch.system, t
         self._model, self._theta = batch.model, batch.theta[index].clone()
         self._batch, self._index = batch, index
@@ -238,17 +287,14 @@ def _array(values: Tensor) -> Array:
 class AdamLearner:
     """Adam on the newest samples, for the whole batch at once, as Adam is elementwise."""
 
-    def __init__(self, learner: Adam, batch: BatchState) -> None:
+    def __init__(self, learner: Adam, batch: BatchSteps) -> None:
         self._rule, self._batch = learner, batch
         self._moments = torch.zeros_like(batch.theta), torch.zeros_like(batch.theta)
 
     def learn(self, t: int) -> None:
         """Take one step on the samples up to step t: what torch.optim.Adam computes."""
-        batch, rule, newest = (
-            self._batch,
-            self._rule,
-            slice(max(0, t + 1 - self._rule.window), t + 1),
-        )
+        batch, rule = self._batch, self._rule
+        newest = slice(max(0, t + 1 - rule.window), t + 1)
         gradient = loss_gradient(
             batch.model, batch.theta, batch.sampled_states[:, newest], batch.targets[:, newest]
         )
@@ -273,7 +319,7 @@ def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Ten
 class LeastSquaresLearner:
     """Least squares over all samples with the ridge λ: θ = (λI + Σ JᵀJ)⁻¹ Σ Jᵀ(y - offset)."""
 
-    def __init__(self, regularization: float, batch: BatchState) -> None:
+    def __init__(self, regularization: float, batch: BatchSteps) -> None:
         n, q = batch.theta.shape
         self._batch, self._moment = batch, torch.zeros_like(batch.theta)
         self._normal = regularization * torch.eye(q).to(batch.theta).repeat(n, 1, 1)
@@ -292,7 +338,7 @@ class LeastSquaresLearner:
 class NumpyLearner:
     """The updates of a learner that is written in numpy, one trial after the other."""
 
-    def __init__(self, learner: CustomLearner, batch: BatchState) -> None:
+    def __init__(self, learner: CustomLearner, batch: BatchSteps) -> None:
         self._batch = batch
         self._updaters = [
             learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
@@ -314,89 +360,14 @@ class NumpyLearner:
             batch.theta[i] = torch.as_tensor(theta).to(batch.theta)
 
 
-class BatchSteps(BatchState):
-    """The steps of a batch of trials, whatever comes between them: a simulation or a measurement.
-
-    Attributes
-    ----------
-    planners : list of Planner
-        The plan of each trial where the policy is written in numpy.
-    learner : object
-        What takes the learning step of the batch.
-    """
-
-    def __init__(
-        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-    ) -> None:
-        super().__init__(specs, device, module)
-        plans = (custom_planner(spec) for spec in self.specs)
-        self.planners = [plan for plan in plans if plan is not None]
-        learner, policy = self.config.learner, self.config.policy
-        self.learner: AdamLearner | NumpyLearner | LeastSquaresLearner
-        if isinstance(learner, Adam):
-            self.learner = AdamLearner(learner, self)
-        elif isinstance(learner, CustomLearner):
-            self.learner = NumpyLearner(learner, self)
-        else:
-            ridge = getattr(policy, "regularization", getattr(learner, "regularization", 1.0))
-            self.learner = LeastSquaresLearner(float(ridge), self)
-
-    def plan(self, t: int) -> Tensor:
-        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
-        policy, system, x = self.config.policy, self.system, self.states[:, t]
-        if isinstance(policy, OpenLoop) or t == 0:
-            return self.open_loop[:, t]
-        if self.planners:
-            return self._planned_in_numpy(t)
-        if isinstance(policy, Uniform):
-            seen = self.states[:, : t + 1]
-            return uniform_inputs(system, self.model, self.theta, seen, policy.iterations)
-        assert self.information is not None
-        columns = planning_columns(system, self.model, self.theta, x, self.components[:, t])
-        problem = quadratic_problem(self.project(columns), self.information)
-        return d_optimal_inputs(problem, system.gamma, self.ties[:, t])
-
-    def _planned_in_numpy(self, t: int) -> Tensor:
-        """Return the inputs u_t, (n, m), of the trials' own plans; diverged ones get a random one.
-
-        Raises
-        ------
-        SpecificationError
-            If an input has the wrong shape or a norm above γ.
-        """
-        inputs = self.open_loop[:, t].clone()
-        for i in self.alive():
-            chosen = np.asarray(self.planners[i].choose(BatchTrialView(self, i, t)), np.float64)
-            check_choice(self.config.policy.name, chosen, t, self.system)
-            inputs[i] = torch.as_tensor(chosen).to(inputs)
-        return inputs
-
-    def learn(self, t: int) -> None:
-        """Update the parameters with the samples up to step t; diverged trials keep theirs."""
-        before = self.theta.clone()
-        self.learner.learn(t)
-        self.theta.copy_(torch.where(self.diverged, before, self.theta))
-
-    def inform(self, t: int) -> None:
-        """Add JᵀJ at x_t and the parameters after the learning step of time t (equation 5)."""
-        for i in self.alive() if self.planners else ():
-            self.planners[i].observe(BatchTrialView(self, i, t + 1))
-        if self.information is not None:
-            x = self.sampled_states[:, t : t + 1]
-            J = jacobian(self.model, self.system.n_learned, self.theta, x)
-            self.information.add(self.project(J[:, 0]))
-
-
 class Lockstep(BatchSteps):
     """A batch of n trials of one configuration that take each step together.
 
-    Parameters and errors as in :class:`BatchState`.
+    Parameters and errors as in :class:`BatchSteps`.
     """
 
-    def __init__(
-        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-    ) -> None:
-        super().__init__(specs, device, module)
+    def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
+        super().__init__(specs, device)
         system = self.system
         self._episodes = []
         if isinstance(system, BlackBox):
@@ -468,11 +439,6 @@ class Lockstep(BatchSteps):
         self.columns["learn_us"][:, t] = learned
         self.columns["evaluate_us"][:, t] = evaluated
 
-    def note_checkpoint(self, t: int) -> None:
-        """Keep what has been learned after t steps, which is to be assessed."""
-        self.checkpoints[t] = self.theta.cpu().numpy().copy()
-        self.feedbacks[t] = [planner.feedback() for planner in self.planners]
-
     def _clock(self) -> float:
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)
@@ -480,19 +446,18 @@ class Lockstep(BatchSteps):
 
 
 @torch.no_grad()
-def run_trials(
-    specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-) -> list[TrialResult]:
+def run_trials(specs: Sequence[TrialSpec], device: str = "cpu") -> list[TrialResult]:
     """Run trials of one configuration in lockstep; each result equals the trial's run alone.
 
-    Parameters and errors as in :class:`BatchState`. The seconds and microseconds of a
+    Parameters and errors as in :class:`BatchSteps`. The seconds and microseconds of a
     result are the batch's divided by its size.
     """
     wall, cpu = time.perf_counter(), time.process_time()
-    batch = Lockstep(specs, device, module)
+    batch = Lockstep(specs, device)
     for t in range(batch.system.horizon + 1):
-        if t in specs[0].assessed_steps:
-            batch.note_checkpoint(t)
+        if t in specs[0].assessed_steps:  # what has been learned is kept
+            batch.checkpoints[t] = batch.theta.cpu().numpy().copy()
+            batch.feedbacks[t] = [planner.feedback() for planner in batch.planners]
         if t < batch.system.horizon:
             batch.step(t)
     n = len(specs)
@@ -638,14 +603,10 @@ class ReferenceSteps:
 
         Returns whether the parameters are finite.
         """
-        self._batch.observe(t, dt)
-        self.errors[t] = self._prediction_error(t)
-        self._batch.learn(t)
-        self._batch.inform(t)
-        return bool(self._batch.theta.isfinite().all())
-
-    def _prediction_error(self, t: int) -> float:
-        """Return ‖y_t - a_θ(x_t)‖ before it is learned."""
         batch = self._batch
+        batch.observe(t, dt)
         predicted = batch.model(batch.theta, batch.sampled_states[:, t : t + 1])
-        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted[0, 0]))
+        self.errors[t] = float(torch.linalg.vector_norm(batch.targets[0, t] - predicted[0, 0]))
+        batch.learn(t)
+        batch.inform(t)
+        return bool(batch.theta.isfinite().all())

@@ -23,7 +23,7 @@ import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -34,10 +34,9 @@ from torch.nn.utils import parameters_to_vector
 from dopt.algorithm import TIE_MARGIN
 from dopt.errors import SpecificationError
 from dopt.models import MLP, Linear, Model
-from dopt.models.base import Array
 from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
 from dopt.systems.base import System, feature_values, next_state
-from dopt.types import Scalar
+from dopt.types import Array, Scalar
 
 BatchModel = Callable[[Tensor, Tensor], Tensor]
 """a_θ of n trials: parameters (n, q) and states (n, N, d) to accelerations (n, N, r).
@@ -46,20 +45,13 @@ States that are the same for all trials may have 1 in the place of n.
 """
 
 
-@runtime_checkable
-class Networked(Protocol):
-    """A model that is a torch network (:class:`dopt.reference.models.Module`)."""
-
-    def module(self, system: System) -> nn.Module: ...
-
-
 def model_function(system: System, model: Model) -> BatchModel:
     """Return a_θ of a model: a network, or the linear form of physics."""
     if isinstance(model, MLP):
         return mlp_function(system, model)
     if isinstance(model, Linear):
         return linear_function(system)
-    if isinstance(model, Networked):
+    if isinstance(model, Module):
         return network_function(system, model.module(system))
     raise TypeError(f"model {model!r} is no network and not linear: run it in the kernel.")
 

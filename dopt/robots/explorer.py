@@ -526,6 +526,3 @@ def _mean_features(start: Array, end: Array) -> Array:
     cosines, sines = np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)
     result: Array = np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2)
     return result
-
-
-__all__ = ["INPUTS", "RobotExplorer"]

@@ -363,13 +363,3 @@ def _with_constants(columns: Array) -> Array:
     half, full = columns[:, -2].copy(), columns[:, -1].copy()
     columns[:, -2], columns[:, -1] = 2.0 * half - full, 2.0 * (full - half)
     return columns
-
-
-__all__ = [
-    "FRICTION",
-    "SPEEDS",
-    "CoulombViscous",
-    "FrictionLearner",
-    "FrictionModel",
-    "Network",
-]

@@ -425,6 +425,3 @@ def _times(factor: float) -> str:
     text = f"{abs(factor):.3g}"
     sign = "−" if factor < 0 else ""
     return sign if text == "1" else f"{sign}{text} · "
-
-
-__all__ = ["Identifiability", "Parameter", "Unknowns", "count_null", "relative_errors"]

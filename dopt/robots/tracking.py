@@ -201,6 +201,3 @@ def possible_acceleration(
         least = np.minimum(least, np.maximum(share * limits.torque - held, 0.0) / own)
         largest = np.maximum(largest, own)
     return least, largest
-
-
-__all__ = ["BANDWIDTH", "Guard", "KnownBody", "Tracker", "possible_acceleration"]

@@ -307,6 +307,3 @@ def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
     slope = 30.0 * x**2 * (1.0 - x) ** 2
     bend = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
     return w, sign * slope, bend / ramp**2
-
-
-__all__ = ["Family", "Fourier", "JointPath", "Ladder", "Multisine"]

@@ -23,7 +23,7 @@ from dopt.control.planning import Accelerations
 from dopt.learning import LEARNERS, GaussNewton
 from dopt.limits import Limits, names_of
 from dopt.models import MODELS
-from dopt.policies import POLICIES, Policy, TaskOptimal
+from dopt.policies import POLICIES, TaskOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import ExploredPlant
@@ -81,11 +81,7 @@ class Scaled:
 
     def scaled_predictions(self, predict: Accelerations) -> Accelerations:
         """Return a function of scaled numbers for one in the units of the plant."""
-
-        def scaled_predict(states: Array, inputs: Array) -> Array:
-            return predict(states * self.states, inputs * self.inputs) / self.accelerations
-
-        return scaled_predict
+        return lambda x, u: predict(x * self.states, u * self.inputs) / self.accelerations
 
 
 @functools.lru_cache(maxsize=64)
@@ -119,20 +115,12 @@ def scaled_trial(spec: TrialSpec) -> TrialSpec:
     found = scaled(spec.system)
     if not found.is_scaled:
         return spec
-    config = dataclasses.replace(
-        spec.config,
-        system=found.system,
-        policy=_scaled_policy(spec.policy, found),
-        limits=spec.limits and _scaled_limits(spec.limits, found),
-    )
-    return TrialSpec(config, spec.seed)
-
-
-def _scaled_policy(policy: Policy, found: Scaled) -> Policy:
+    policy, limits = spec.policy, spec.limits and _scaled_limits(spec.limits, found)
     if isinstance(policy, TaskOptimal) and policy.goal:
         goal = found.of_states(np.array(policy.goal))
-        return dataclasses.replace(policy, goal=tuple(goal.tolist()))
-    return policy
+        policy = dataclasses.replace(policy, goal=tuple(goal.tolist()))
+    config = dataclasses.replace(spec.config, system=found.system, policy=policy, limits=limits)
+    return TrialSpec(config, spec.seed)
 
 
 def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
@@ -142,13 +130,9 @@ def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
     def divided(name: str, number: float) -> float:
         return float(rounded(number / units[name])) if math.isfinite(number) else number
 
-    return dataclasses.replace(
-        limits,
-        bounds=tuple(
-            (name, divided(name, low), divided(name, high)) for name, low, high in limits.bounds
-        ),
-        rates=tuple((name, divided(name, rate)) for name, rate in limits.rates),
-    )
+    bounds = tuple((name, divided(name, a), divided(name, b)) for name, a, b in limits.bounds)
+    rates = tuple((name, divided(name, rate)) for name, rate in limits.rates)
+    return dataclasses.replace(limits, bounds=bounds, rates=rates)
 
 
 def learned_accelerations(
