@@ -209,11 +209,12 @@ class Explorer(SavedExplored):
         )
         instance("journal", journal, str | Path | None, "the path of a file")
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
-        if _name_of(learner) == SimulationError.name:
+        section = isinstance(learner, Mapping)
+        named = learner.get("name") if section else getattr(learner, "name", learner)
+        if named == SimulationError.name:
             model = {"name": "mlp", "depth": 1} if model is None else model
-            plant = (
-                dataclasses.replace(plant, integrator="rk4") if isinstance(plant, Plant) else plant
-            )
+            if isinstance(plant, Plant):
+                plant = dataclasses.replace(plant, integrator="rk4")
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
         spec = TrialSpec.of_system(
             *(system, policy),
@@ -513,11 +514,6 @@ class Explorer(SavedExplored):
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-
-def _name_of(part: object) -> object:
-    """Return the name of a section or an object, or the name itself."""
-    return part.get("name") if isinstance(part, Mapping) else getattr(part, "name", part)
 
 
 def _about(spec: TrialSpec) -> Event:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,7 +11,7 @@ import numpy as np
 from dopt.fields import parameter
 from dopt.models.base import Model
 from dopt.systems.base import Feature, System
-from dopt.types import Array, Scalar
+from dopt.types import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,12 +174,8 @@ class GreyBox(Model):
     def feature_scales(self, system: System) -> tuple[float, ...]:
         return (1.0,) * len(self.features(system))
 
-    def physical_values(self, system: System, theta: Sequence[Scalar]) -> list[Scalar]:
-        """Return all physical parameters in their order, with q unknown ones, each of any kind."""
-        values = dict(zip(system.physical, system.parameters, strict=True))
-        return list((values | dict(zip(self.names(system), theta, strict=True))).values())
-
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
-        values = self.physical_values(system, parameters.tolist())
-        rows = system.accelerations(tuple(points.T), values)
+        values = dict(zip(system.physical, system.parameters, strict=True))
+        values |= dict(zip(self.names(system), parameters.tolist(), strict=True))
+        rows = system.accelerations(tuple(points.T), list(values.values()))
         return np.stack(np.broadcast_arrays(*rows, points[:, 0])[:-1], axis=-1)

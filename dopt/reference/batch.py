@@ -259,11 +259,11 @@ class BatchTrialView(TrialView):
 
     @property
     def covariance(self) -> Array:
-        assert self._batch.information is not None
-        identity = (
-            torch.eye(len(self._theta)).to(self._batch.theta).repeat(len(self._batch.theta), 1, 1)
-        )
-        return _array(self._batch.information.solve(identity)[self._index])
+        batch = self._batch
+        assert batch.information is not None
+        n, q = batch.theta.shape
+        identity = torch.eye(q).to(batch.theta).repeat(n, 1, 1)
+        return _array(batch.information.solve(identity)[self._index])
 
     def following(self, state: Array, inputs: Array) -> Array:
         u = self._tensor(inputs)
