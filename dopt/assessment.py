@@ -69,8 +69,7 @@ def wrap(angle: Array, centre: float = 0.0) -> Array:
 
 def turns(angle: Array, centre: float = 0.0) -> Array:
     """Return the number of whole turns between each angle and its wrapped value."""
-    count: Array = np.floor((angle - centre + math.pi) / TURN)
-    return count
+    return np.floor((angle - centre + math.pi) / TURN)
 
 
 @dataclass(frozen=True)

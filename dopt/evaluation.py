@@ -71,8 +71,7 @@ def _in_ball(system: System, n: int) -> Array:
     """Return inputs, (n, m), uniform in the ball ‖u‖ ≤ γ; always the same."""
     rng, m = np.random.default_rng(_SEED), system.n_inputs
     directions = on_sphere(rng.standard_normal((n, m)), system.gamma)
-    inputs: Array = directions * ball_norms(rng, (n, 1), m)
-    return inputs
+    return directions * ball_norms(rng, (n, 1), m)
 
 
 def _held_out(system: BlackBox) -> EvaluationSet:

@@ -145,8 +145,7 @@ def process_noise(system: System, seed: int) -> Array:
 def measurement_noise(system: System, seed: int) -> Array:
     """Return v_{t+1} of y = C x + v, (T, n), for the measured states."""
     noise = stream(seed, "measurement_noise").standard_normal((system.horizon, system.n_measured))
-    scaled: Array = np.array(system.measurement_noise) * noise
-    return scaled
+    return np.array(system.measurement_noise) * noise
 
 
 def initial_weights(spec: TrialSpec) -> Array:

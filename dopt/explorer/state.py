@@ -322,8 +322,7 @@ class ExplorerState:
 
     @property
     def _trial(self) -> Trial:
-        trial: Trial = self.steps.trial  # type: ignore[union-attr]  # of a learner of the kernel
-        return trial
+        return self.steps.trial  # type: ignore[union-attr]  # of a learner of the kernel
 
     def _samples(self, learner: GaussNewton) -> FitRequest:
         from dopt.kernel.learners import Problem

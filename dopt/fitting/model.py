@@ -382,8 +382,7 @@ class Model:
         phi = np.select(
             [s.feature_kinds == 1, s.feature_kinds == 2], [np.cos(x), np.sin(x)], scaled
         )
-        out: Array = (np.tanh(phi @ W1.T + b1) @ W2.T + b2) * self.sizes
-        return out
+        return (np.tanh(phi @ W1.T + b1) @ W2.T + b2) * self.sizes
 
     def matrices(self, weights: Array) -> tuple[Array, Array, Array, Array]:
         """Return W₁, (w, p), b₁, (w,), W₂, (r, w), and b₂, (r,), of the network."""

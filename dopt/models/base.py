@@ -200,8 +200,7 @@ class AffineMLP(BlackBoxMLP):
         m = system.n_inputs
         u = features[:, -m:]
         products = [hidden * u[:, j : j + 1] for j in range(m)]
-        inputs: Array = np.concatenate([hidden, *products, u], axis=1)
-        return inputs
+        return np.concatenate([hidden, *products, u], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,8 +41,7 @@ class Linear(Model):
             for form in system.linear_form
         )
         regressors = np.stack([unit - offset for unit in units], axis=-1)
-        predicted: Array = offset + regressors @ parameters
-        return predicted
+        return offset + regressors @ parameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +92,7 @@ class RFF(Model):
         weights = parameters[:first].reshape(system.n_learned, self.n_features)
         frequencies = parameters[first:last].reshape(self.n_features, len(system.features))
         waves = np.cos(system.featurize(points) @ frequencies.T + parameters[last:])
-        predicted: Array = self.scale * waves @ weights.T
-        return predicted
+        return self.scale * waves @ weights.T
 
     @property
     def scale(self) -> float:
@@ -122,8 +120,7 @@ class LinearState(Model):
 
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         matrix = parameters.reshape(system.n_learned, len(system.features))
-        predicted: Array = system.featurize(points) @ matrix.T
-        return predicted
+        return system.featurize(points) @ matrix.T
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -232,8 +232,7 @@ def check_norms(name: str, inputs: Array, first: int, gamma: float) -> None:
 
 def ball_norms(rng: np.random.Generator, size: tuple[int, int], dimensions: int | Array) -> Array:
     """Return norms of points that are drawn uniformly from the unit ball of some dimensions."""
-    norms: Array = rng.uniform(size=size) ** (1.0 / dimensions)
-    return norms
+    return rng.uniform(size=size) ** (1.0 / dimensions)
 
 
 def on_sphere(vectors: Array, radius: float) -> Array:

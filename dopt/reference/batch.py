@@ -280,8 +280,7 @@ class BatchTrialView(TrialView):
 
 def _array(values: Tensor) -> Array:
     """Return a copy, so that nobody can change the trial."""
-    array: Array = values.detach().cpu().numpy().copy()
-    return array
+    return values.detach().cpu().numpy().copy()
 
 
 class AdamLearner:
@@ -531,14 +530,12 @@ class ReferenceTrial:
     @property
     def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.theta[0].numpy()
-        return parameters
+        return self._batch.theta[0].numpy()
 
     @property
     def states(self) -> Array:
         """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
-        states: Array = self._batch.states[0].numpy()
-        return states
+        return self._batch.states[0].numpy()
 
 
 class ReferenceSteps:
@@ -559,8 +556,7 @@ class ReferenceSteps:
     @property
     def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.theta[0].numpy().copy()
-        return parameters
+        return self._batch.theta[0].numpy().copy()
 
     def begin(self, t: int, state: Array) -> None:
         """Let step t begin at a state, (d,), whatever came before it."""

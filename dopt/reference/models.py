@@ -156,8 +156,7 @@ def linear_function(system: System) -> BatchModel:
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
         offset, *units = (stack(system.accelerations(x.unbind(-1), p)) for p in system.linear_form)
         psi = torch.stack([unit - offset for unit in units], dim=-1)
-        out: Tensor = offset + (psi @ theta[:, None, :, None]).squeeze(-1)
-        return out
+        return offset + (psi @ theta[:, None, :, None]).squeeze(-1)
 
     return accelerations
 
@@ -385,8 +384,7 @@ def _built(model: Module, n_features: int, n_outputs: int, seed: int) -> nn.Modu
 
 
 def _array(values: torch.Tensor) -> Array:
-    array: Array = values.detach().numpy().astype(np.float64)
-    return array
+    return values.detach().numpy().astype(np.float64)
 
 
 def _wrong(model: Module, expected: str, given: object) -> SpecificationError:

@@ -203,8 +203,7 @@ def _friction(body: Body, limits: Limits) -> Array:
     """Return the friction of each joint at its limit of velocity, or a typical one, (n,)."""
     model = body.model
     own = model.dof_frictionloss[body.dofs] + model.dof_damping[body.dofs] * limits.velocity
-    result: Array = np.where(own > 0.0, own, 0.1 * limits.torque)
-    return result
+    return np.where(own > 0.0, own, 0.1 * limits.torque)
 
 
 @dataclasses.dataclass(frozen=True)

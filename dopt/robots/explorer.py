@@ -385,8 +385,7 @@ class RobotExplorer:
             self._away = AWAY
             return None
         demand = mass @ self._a + bias + friction
-        torque: Array = np.minimum(np.maximum(demand, -limits.torque), limits.torque)
-        return torque
+        return np.minimum(np.maximum(demand, -limits.torque), limits.torque)
 
     # What a window teaches.
 
@@ -442,8 +441,7 @@ class RobotExplorer:
         """Return torques by mass and first moment on the last body, (k, n, 4), parts of limits."""
         q, v, a = (np.array([means[i] for means in windows]) for i in range(3))
         rows = self.body.regressor(Motion(self.learner.window.seconds, q, v, a))[:, :, -10:-6]
-        result: Array = rows / self.limits.torque[:, None]
-        return result
+        return rows / self.limits.torque[:, None]
 
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.

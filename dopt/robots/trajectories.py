@@ -78,8 +78,7 @@ class Family(ABC):
     def _centres(self, numbers: Array) -> Array:
         """Return the positions about which joints move, (n,): the middle third of the ranges."""
         half = ROOM * np.diff(self.limits.position, axis=1)[:, 0] / 2.0
-        result: Array = self.limits.middle + half / 3.0 * np.tanh(numbers)
-        return result
+        return self.limits.middle + half / 3.0 * np.tanh(numbers)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -76,8 +76,7 @@ class Scaled:
     @functools.cached_property
     def accelerations(self) -> Array:
         """What its learned accelerations are multiplied by, (r,), in units of the plant."""
-        learned: Array = self.states[list(self.system.learned_rows)]
-        return learned
+        return self.states[list(self.system.learned_rows)]
 
     def scaled_predictions(self, predict: Accelerations) -> Accelerations:
         """Return a function of scaled numbers for one in the units of the plant."""
@@ -146,5 +145,4 @@ def learned_accelerations(
     found = scaled(spec.system)
     u = None if inputs is None else found.of_inputs(inputs)
     values = spec.model.predict(found.system, parameters, found.of_states(states), u)
-    predicted: Array = values * found.accelerations
-    return predicted
+    return values * found.accelerations
