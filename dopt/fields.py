@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import inspect
 import math
 import re
@@ -159,12 +158,16 @@ class _Kind(NamedTuple):
     optional: bool = False
 
 
-@functools.cache
 def _kinds(cls: type[Validated]) -> dict[str, _Kind]:
     """Return what the fields of a class hold, read once from their annotations."""
-    check_own_fields(cls)
-    fields = [f for f in dataclasses.fields(cls) if f.metadata.get("validated", True)]
-    return {field.name: _kind(cls, field) for field in fields}
+    if cls not in _known:
+        check_own_fields(cls)
+        fields = [f for f in dataclasses.fields(cls) if f.metadata.get("validated", True)]
+        _known[cls] = {field.name: _kind(cls, field) for field in fields}
+    return _known[cls]
+
+
+_known: dict[type, dict[str, _Kind]] = {}
 
 
 def _kind(cls: type[Validated], field: dataclasses.Field[Any]) -> _Kind:

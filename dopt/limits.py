@@ -185,8 +185,7 @@ _PAIR = "a pair of numbers, the lower one first, or null for none"
 
 
 def _pair(name: str, given: object) -> tuple[object, object]:
-    fits = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
-    if not fits or len(given) != 2:
+    if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray) or len(given) != 2:
         raise _unlike(f"bounds.{name}", given, _PAIR)
     return given[0], given[1]
 

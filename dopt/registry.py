@@ -11,7 +11,6 @@ import ast
 import codecs
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import importlib.util
 import inspect
@@ -291,7 +290,6 @@ _TYPED = ("__main__.", "builtins.")
 """Modules of what is typed into a notebook or a script, or executed as text."""
 
 
-@functools.cache
 def source_digest(cls: type) -> str:
     """Return the digest of the file that defines a class, as it was when first asked for.
 
@@ -302,7 +300,12 @@ def source_digest(cls: type) -> str:
     SpecificationError
         If the source cannot be read, as for a class typed into an interpreter.
     """
-    return _digest(_source(cls))
+    if cls not in _digests:
+        _digests[cls] = _digest(_source(cls))
+    return _digests[cls]
+
+
+_digests: dict[type, str] = {}
 
 
 def _digest(content: bytes) -> str:

@@ -209,8 +209,8 @@ class Explorer(SavedExplored):
         )
         instance("journal", journal, str | Path | None, "the path of a file")
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
-        section = isinstance(learner, Mapping)
-        named = learner.get("name") if section else getattr(learner, "name", learner)
+        named = getattr(learner, "name", learner)
+        named = learner.get("name") if isinstance(learner, Mapping) else named
         if named == SimulationError.name:
             model = {"name": "mlp", "depth": 1} if model is None else model
             if isinstance(plant, Plant):

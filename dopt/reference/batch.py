@@ -445,16 +445,20 @@ class Lockstep(BatchSteps):
 
 
 @torch.no_grad()
-def run_trials(specs: Sequence[TrialSpec], device: str = "cpu") -> list[TrialResult]:
+def run_trials(
+    specs: Sequence[TrialSpec], device: str = "cpu", noted: Sequence[int] | None = None
+) -> list[TrialResult]:
     """Run trials of one configuration in lockstep; each result equals the trial's run alone.
 
     Parameters and errors as in :class:`BatchSteps`. The seconds and microseconds of a
-    result are the batch's divided by its size.
+    result are the batch's divided by its size. ``noted`` are the steps of its checkpoints, in place
+    of those at which the trial is assessed.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     batch = Lockstep(specs, device)
+    noted = specs[0].assessed_steps if noted is None else noted
     for t in range(batch.system.horizon + 1):
-        if t in specs[0].assessed_steps:  # what has been learned is kept
+        if t in noted:
             batch.checkpoints[t] = batch.theta.cpu().numpy().copy()
             batch.feedbacks[t] = [planner.feedback() for planner in batch.planners]
         if t < batch.system.horizon:
@@ -487,55 +491,6 @@ def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
         checkpoints={t: batch.checkpoints[t][i] for t in reached},
         feedbacks={t: feedback for t, feedback in learned.items() if feedback is not None},
     )
-
-
-class ReferenceTrial:
-    """A batch of one trial.
-
-    Attributes
-    ----------
-    done : int
-        Number of steps done.
-    diverged_at : int or None
-        Step at which the trial diverged.
-    """
-
-    def __init__(self, spec: TrialSpec) -> None:
-        with torch.no_grad():
-            self._batch = Lockstep([spec])
-        self.done = 0
-        self.diverged_at: int | None = None
-
-    @torch.no_grad()
-    def advance(self, last: int) -> None:
-        """Run the steps up to ``last``, unless they are done or the trial has diverged.
-
-        Raises
-        ------
-        SpecificationError
-            If ``last`` lies beyond the horizon.
-        """
-        horizon = self._batch.system.horizon
-        if last > horizon:
-            raise SpecificationError(
-                f"step {last} was asked for, but the horizon is {horizon}: raise env.horizon."
-            )
-        while self.done < last and self.diverged_at is None:
-            self._batch.step(self.done)
-            if bool(self._batch.diverged[0]):
-                self.diverged_at = self.done
-            else:
-                self.done += 1
-
-    @property
-    def parameters(self) -> Array:
-        """Parameters of the model, (q,)."""
-        return self._batch.theta[0].numpy()
-
-    @property
-    def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
-        return self._batch.states[0].numpy()
 
 
 class ReferenceSteps:

@@ -95,14 +95,19 @@ class Limits:
         result: Array = self.position.mean(axis=1)
         return result
 
-    def shares(self, motion: Motion) -> dict[str, float]:
-        """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
+    def parts(self, motion: Motion, torques: Array | None = None) -> dict[str, Array]:
+        """Return a motion as parts of each kind of limit, (T, n); 1 and -1 are the limits."""
         half = np.diff(self.position, axis=1)[:, 0] / 2.0
         parts = {
             "position": (motion.positions - self.middle) / half,
             "velocity": motion.velocities / self.velocity,
             "acceleration": motion.accelerations / self.acceleration,
         }
+        return parts if torques is None else parts | {"torque": torques / self.torque}
+
+    def shares(self, motion: Motion) -> dict[str, float]:
+        """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
+        parts = self.parts(motion)
         return {kind: float(np.abs(part).max()) for kind, part in parts.items()}
 
 

@@ -455,9 +455,17 @@ def flatten(config: Mapping[str, object], prefix: str = "") -> dict[str, object]
     return flat
 
 
-@functools.cache
 def _defaults(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:
     """Return the section of a class with nothing set; of a task, as the system resolves it."""
+    if (cls, env) not in _known:
+        _known[cls, env] = _default_section(cls, env)
+    return _known[cls, env]
+
+
+_known: dict[tuple[type, type | None], Mapping[str, object]] = {}
+
+
+def _default_section(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:
     try:
         item = cls()
         system = env() if env else None
