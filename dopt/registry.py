@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, TypeVar, cast
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, check_own_fields
@@ -58,17 +58,11 @@ def build(section: str, registry: Mapping[str, type[T]], given: Part) -> T:
     return cls(**{key: value for key, value in given.items() if key not in _ABOUT})
 
 
-@runtime_checkable
-class Wrapper(Protocol):
-    """A specification of something that is no dataclass of ours, which writes its own section."""
-
-    def to_section(self) -> dict[str, object]: ...
-
-
 def section_of(item: Validated) -> dict[str, object]:
     """Return the configuration section that :func:`build` turns into ``item``."""
-    if isinstance(item, Wrapper):
-        return item.to_section()
+    if hasattr(item, "to_section"):  # of something that is no dataclass of ours
+        written: dict[str, object] = item.to_section()
+        return written
     fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
     listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
     cls, origin = type(item), dict[str, object]()
@@ -115,13 +109,7 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
     """Import a class of the user's own and see that it fits."""
     path = str(given[TARGET])
     own = _fitting(section, registry, path, imported(section, path, given))
-    name = own.__dict__["name"]
-    if given.get("name", name) != name:
-        raise SpecificationError(
-            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
-            f"leave {section}.name out, or correct it."
-        )
-    check_source(section, path, own, given)
+    check_source(section, path, own, given, own.__dict__["name"])
     return own
 
 
@@ -142,8 +130,15 @@ def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any)
     return own
 
 
-def check_source(section: str, path: str, cls: type, given: Mapping[str, object]) -> None:
-    """Refuse a section that was stored when the file of its class was another one."""
+def check_source(
+    section: str, path: str, cls: type, given: Mapping[str, object], name: str
+) -> None:
+    """Refuse a section of another name, or stored when the file of its class was another one."""
+    if given.get("name", name) != name:
+        raise SpecificationError(
+            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
+            f"leave {section}.name out, or correct it."
+        )
     if given.get(SOURCE, source_digest(cls)) != source_digest(cls):
         raise _changed(section, path)
 

@@ -21,7 +21,7 @@ from dopt.arguments import finite, instance, measured, numbers, safe_input, seco
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside, first_evidence, first_simulation
-from dopt.explorer.saving import SavedExplored
+from dopt.explorer.saving import Explored
 from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
 from dopt.learning import Conditioning, GaussNewton, Learner, SimulationError
 from dopt.models import Model
@@ -96,7 +96,7 @@ STEPS = 20_000
 """Steps of an exploration unless it is told otherwise."""
 
 
-class Explorer(SavedExplored):
+class Explorer(Explored):
     """Explores a plant: chooses its inputs, and learns from the states that follow.
 
     >>> explorer = Explorer(plant, policy="d_optimal", journal="run.jsonl")

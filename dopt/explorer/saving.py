@@ -182,8 +182,14 @@ KINDS = (
 """Kinds of events in :attr:`Explored.counts`."""
 
 
+Run = tuple[npt.ArrayLike, npt.ArrayLike]
+"""States, (T + 1, d), and inputs, (T, m)."""
+
+
 class Explored:
-    """States, inputs, errors and predictions of an exploration.
+    """States, inputs, errors and predictions of an exploration, which can be saved meanwhile.
+
+    Whatever changes it holds ``_lock``, so that another thread can save it.
 
     Attributes
     ----------
@@ -193,6 +199,12 @@ class Explored:
 
     def __init__(self, spec: TrialSpec) -> None:
         self.spec, self._state = spec, ExplorerState(spec)
+        self._lock, self._closed = threading.Lock(), False
+        self._saving = threading.Lock()
+        self._savers: dict[str | None, ExplorationSaver] = {}
+        weakref.finalize(self, _close, self._savers)
+        self._begun = time.perf_counter(), time.process_time()
+        self._times = np.full((2, spec.system.horizon), np.nan)  # µs of ask() and tell()
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -299,55 +311,6 @@ class Explored:
         """
         return free_run_error(self.spec, self.predict, states, inputs, steps, self._state.system)
 
-
-def predict(
-    spec: TrialSpec,
-    parameters: Array,
-    states: npt.ArrayLike,
-    inputs: npt.ArrayLike | None = None,
-) -> Array:
-    """Return the accelerations, (N, r), that a model of given parameters has learned."""
-    system = spec.system
-    at = _rows("states", states, system.n_states)
-    u = None if inputs is None else _rows("inputs", inputs, system.n_inputs)
-    if u is not None and len(u) != len(at):
-        raise SpecificationError(
-            f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
-            f"give the input of each state."
-        )
-    return learned_accelerations(spec, parameters, at, u)
-
-
-def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
-    rows = np.atleast_2d(reals(what, given))
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise SpecificationError(
-            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
-            f"them."
-        )
-    return rows
-
-
-Run = tuple[npt.ArrayLike, npt.ArrayLike]
-"""States, (T + 1, d), and inputs, (T, m)."""
-
-
-class SavedExplored(Explored):
-    """An exploration that can be saved while it goes on.
-
-    Whatever changes it holds ``_lock``, so that another thread can save it.
-    """
-
-    def __init__(self, spec: TrialSpec) -> None:
-        super().__init__(spec)
-        self._lock = threading.Lock()
-        self._closed = False
-        self._saving = threading.Lock()
-        self._savers: dict[str | None, ExplorationSaver] = {}
-        weakref.finalize(self, _close, self._savers)
-        self._begun = time.perf_counter(), time.process_time()
-        self._times = np.full((2, spec.system.horizon), np.nan)  # µs of ask() and tell()
-
     def save(self, url: str | None = None, test: Run | None = None) -> bool:
         """Store the exploration so far as a trial in the results database of the launches.
 
@@ -445,6 +408,34 @@ class SavedExplored(Explored):
         """End the launches of the saves."""
         with self._saving:
             _close(self._savers)
+
+
+def predict(
+    spec: TrialSpec,
+    parameters: Array,
+    states: npt.ArrayLike,
+    inputs: npt.ArrayLike | None = None,
+) -> Array:
+    """Return the accelerations, (N, r), that a model of given parameters has learned."""
+    system = spec.system
+    at = _rows("states", states, system.n_states)
+    u = None if inputs is None else _rows("inputs", inputs, system.n_inputs)
+    if u is not None and len(u) != len(at):
+        raise SpecificationError(
+            f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
+            f"give the input of each state."
+        )
+    return learned_accelerations(spec, parameters, at, u)
+
+
+def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
+    rows = np.atleast_2d(reals(what, given))
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise SpecificationError(
+            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
+            f"them."
+        )
+    return rows
 
 
 def _close(savers: dict[str | None, ExplorationSaver]) -> None:

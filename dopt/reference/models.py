@@ -302,14 +302,8 @@ class Module(Model):
                 f"model.{TARGET} is '{target}', but a class derived from torch.nn.Module is "
                 f"expected: correct the class or the path."
             )
-        check_source("model", target, network, given)
-        model = cls(target=target, source=source_digest(network), arguments=_canonical(given))
-        if given.get("name", model.name) != model.name:
-            raise SpecificationError(
-                f"model.name is '{given['name']}', but {target} is called '{model.name}': leave "
-                f"model.name out, or correct it."
-            )
-        return model
+        check_source("model", target, network, given, target.rpartition(".")[2])
+        return cls(target=target, source=source_digest(network), arguments=_canonical(given))
 
     def to_section(self) -> dict[str, object]:
         """Return the section from which :meth:`from_section` makes this model."""
@@ -321,7 +315,7 @@ class Module(Model):
         given = {SOURCE: self.source}
         found: Any = imported("model", self.target, given)
         network: type[nn.Module] = found
-        check_source("model", self.target, network, given)
+        check_source("model", self.target, network, given, self.name)
         return network
 
     def module(self, system: System) -> nn.Module:
