@@ -328,3 +328,5 @@ def register_systems() -> None:
 
 
 register_systems()
+
+__all__ = ["Environment", "Exploration", "register_systems"]

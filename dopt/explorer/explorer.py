@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import TIMEOUT_MAX
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Self
 
 import numpy as np
@@ -52,44 +52,10 @@ def uninterrupted() -> Iterator[None]:
             before(signal.SIGINT, pressed[0])
 
 
-# Count of states in a row from which nothing was learned, with one warning when they are many.
-
-
 MANY = 20
 """States in a row from which nothing was learned that are said."""
 
 _log = logging.getLogger("dopt.explorer")
-
-
-class UnlearnedStates:
-    """States since the last one that was learned from, by the events of an exploration.
-
-    Parameters
-    ----------
-    dt : float
-        Time from one state to the next that is expected [s].
-    """
-
-    def __init__(self, dt: float) -> None:
-        self._dt = dt
-        self._in_a_row = 0
-
-    def note(self, event: Event, counts: Mapping[str, int]) -> None:
-        """Count the state of an event; warn at the ``MANY``-th, with the counts of all states."""
-        if "learn" in event:
-            self._in_a_row = 0
-            return
-        if not event.keys().isdisjoint(("plan", "missed")) or event.get("lost") == "resets":
-            return
-        self._in_a_row += 1
-        if self._in_a_row == MANY:
-            _log.warning(
-                "nothing was learned from the last %d states (%s), but states are expected every "
-                "%g s: tell() each state that followed an input, give times in seconds, call "
-                "reset() if their clock restarted, and give a limit that no state is beyond, and "
-                "a policy and a learner that are faster than that",
-                *(MANY, counts, self._dt),
-            )
 
 
 STEPS = 20_000
@@ -253,7 +219,7 @@ class Explorer(Explored):
         self._limits[self._angles] = np.finfo(float).max
         super().__init__(spec)
         self._plans_each_step = may_remember_plans(spec)
-        self._unlearned = UnlearnedStates(spec.system.dt)
+        self._unlearned = 0  # states in a row from which nothing was learned
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
         self._planner = PunctualPlanner(self._state.plan, deadline)
         self._fits: FitBeside | None = None
@@ -452,7 +418,18 @@ class Explorer(Explored):
         if self._journal is not None:
             self._journal.write(event, durable=durable)
         self._state.do(event)
-        self._unlearned.note(event, self.counts)
+        if "learn" in event:
+            self._unlearned = 0
+        elif event.keys().isdisjoint(("plan", "missed")) and event.get("lost") != "resets":
+            self._unlearned += 1
+            if self._unlearned == MANY:
+                _log.warning(
+                    "nothing was learned from the last %d states (%s), but states are expected "
+                    "every %g s: tell() each state that followed an input, give times in seconds, "
+                    "call reset() if their clock restarted, and give a limit that no state is "
+                    "beyond, and a policy and a learner that are faster than that",
+                    *(MANY, self.counts, self.spec.system.dt),
+                )
 
     def _plan(self) -> None:
         """Plan for the present state; the fallback is the answer if that is not ready in time."""
@@ -507,12 +484,7 @@ class Explorer(Explored):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
