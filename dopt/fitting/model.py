@@ -255,7 +255,7 @@ class Model:
         seed: int = 0,
         longest_step: float | None = None,
     ) -> None:
-        self.plant, self.width, self.layout, self.delay = plant, width, layout, delay
+        self.plant, self.width, self.delay = plant, width, delay
         system = plant.system(1)
         self.d, self.m = len(plant.states), len(plant.inputs)
         known = compiled_known(PlantKey(plant))
