@@ -168,8 +168,7 @@ def advance(
     """Return the state and what acts after a time under an input that is held."""
 
     def acts(s: float) -> Array:
-        reached: Array = u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
-        return reached
+        return u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
 
     def rate(state: Array, s: float) -> Array:
         flow: Array = model.derivative(p, state[None], acts(s)[None])[0]

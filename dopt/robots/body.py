@@ -44,10 +44,6 @@ class Motion:
     accelerations: Array
 
     @property
-    def seconds(self) -> float:
-        return len(self.positions) * self.dt
-
-    @property
     def times(self) -> Array:
         """Time of each row, (T,) [s]."""
         return self.dt * np.arange(len(self.positions), dtype=float)
@@ -375,23 +371,19 @@ def _skew(vectors: Array) -> Array:
 
 def _cross(a: Array, b: Array) -> Array:
     """Return cross products, (T, 3), in a third of the time of ``numpy.cross``."""
-    result: Array = a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
-    return result
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def _shifted(vector: Array, origin: Array) -> Array:
     """Return the linear part of spatial motions at other origins, (T, 3)."""
-    result: Array = vector[:, 3:] + _cross(vector[:, :3], origin)
-    return result
+    return vector[:, 3:] + _cross(vector[:, :3], origin)
 
 
 def _crossed(velocity: Array, column: Array) -> Array:
     """Return the rate of a motion that moves with a velocity, (T, 6)."""
     spin, speed = velocity[:, :3], velocity[:, 3:]
-    angular = _cross(spin, column[:, :3])
-    return np.concatenate(
-        [angular, _cross(speed, column[:, :3]) + _cross(spin, column[:, 3:])], axis=1
-    )
+    linear = _cross(speed, column[:, :3]) + _cross(spin, column[:, 3:])
+    return np.concatenate([_cross(spin, column[:, :3]), linear], axis=1)
 
 
 def _turns(axis: Array, angles: Array) -> Array:
@@ -414,12 +406,9 @@ def _driven_joints(model: mujoco.MjModel) -> list[int]:
     free = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
     if not model.nu:
         return free
-    by_joint = {int(model.actuator_trnid[a, 0]) for a in range(model.nu) if _of_joint(model, a)}
+    of_joints = np.isin(model.actuator_trntype, (0, 1))  # of a joint, or in its parent's frame
+    by_joint = {int(j) for j in model.actuator_trnid[of_joints, 0]}
     return [j for j in free if j in by_joint] or free
-
-
-def _of_joint(model: mujoco.MjModel, actuator: int) -> bool:
-    return int(model.actuator_trntype[actuator]) in (0, 1)  # joint, or joint in its parent's frame
 
 
 def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
@@ -458,6 +447,3 @@ def without_meshes(source: Path) -> mujoco.MjSpec:
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
     return spec
-
-
-__all__ = ["INERTIAL", "Body", "Motion", "inertial_row", "rotation", "without_meshes"]

@@ -106,9 +106,9 @@ class Limits:
         }
         return parts if torques is None else parts | {"torque": torques / self.torque}
 
-    def shares(self, motion: Motion, torques: Array | None = None) -> dict[str, float]:
+    def shares(self, motion: Motion) -> dict[str, float]:
         """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
-        parts = self.parts(motion, torques)
+        parts = self.parts(motion)
         return {kind: float(np.abs(part).max()) for kind, part in parts.items()}
 
 
@@ -246,6 +246,3 @@ def _unlike(source: Path, what: str, value: object, expected: str) -> Specificat
     return SpecificationError(
         f"{what} in {source} is {value!r}, but {expected} is expected: correct it."
     )
-
-
-__all__ = ["KINDS", "Limits"]

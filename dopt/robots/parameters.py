@@ -259,13 +259,11 @@ class Unknowns:
             else:
                 moved = motion.accelerations if one.kind == "armature" else motion.velocities
                 result[:, k, i] = moved[:, k]
-        scaled: Array = result * self.scales
-        return scaled
+        return result * self.scales
 
     def _signs(self, motion: Motion) -> Array:
         """Return the signs of the velocities, smooth about 0, (T, n)."""
-        result: Array = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
-        return result
+        return np.tanh(motion.velocities / (SLOW * self.limits.velocity))
 
     def _inertial_directions(self, places: list[int]) -> Array:
         """Return the change of the inertial parameters with each unknown one, (10 · bodies, p)."""
@@ -299,8 +297,7 @@ class Unknowns:
             Independent measurements of each torque in a second [Hz].
         """
         flat = self.weighted(motion, rate, rigid).reshape(-1, len(self))
-        result: Array = flat.T @ flat
-        return result
+        return flat.T @ flat
 
     def weighted(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the regressor in units of the noise, (T, n, p), as of ``rate`` rows a second."""
@@ -369,8 +366,7 @@ def _null_space(rows: Array) -> tuple[Array, Array]:
 def relative_errors(information: Array) -> Array:
     """Return standard errors with a prior of standard deviation 1, (p,)."""
     covariance = np.linalg.inv(information + np.eye(len(information)))
-    result: Array = np.sqrt(np.diag(covariance))
-    return result
+    return np.sqrt(np.diag(covariance))
 
 
 def _sparse(rows: Array) -> Array:
@@ -427,6 +423,3 @@ def _times(factor: float) -> str:
     text = f"{abs(factor):.3g}"
     sign = "−" if factor < 0 else ""
     return sign if text == "1" else f"{sign}{text} · "
-
-
-__all__ = ["Identifiability", "Parameter", "Unknowns", "count_null", "relative_errors"]

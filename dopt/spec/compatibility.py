@@ -116,12 +116,10 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     _check_model(system, policy, model, learner)
     _check_inputs(system, policy, model, learner)
     if not _teaches(type(learner), type(model)):
-        raise mismatch(
-            f"learner '{learner.name}'",
-            f"{_taught(learner)} and {given} with {_teachers(model)}",
-            "the two together",
-            "were",
-        )
+        taught = [name for name, one in MODELS.items() if _teaches(type(learner), one)]
+        teachers = [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
+        expected = f"{_choice('model', taught)} and {given} with {_choice('learner', teachers)}"
+        raise mismatch(f"learner '{learner.name}'", expected, "the two together", "were")
     fits = not isinstance(learner, GaussNewton) or learner.refit_every == 1
     if isinstance(model, Ensemble) and not fits:
         # a filter between two fits would keep the M of one network
@@ -216,16 +214,6 @@ def _teaches(learner: type[Learner], model: type[Model]) -> bool:
     filtered = issubclass(learner, ExtendedKalman | JointKalman) and issubclass(model, Linear)
     fitted = issubclass(learner, GaussNewton) and issubclass(model, Ensemble)
     return filtered or fitted or learner.structure == model.structure
-
-
-def _taught(learner: Learner) -> str:
-    return _choice("model", [name for name, one in MODELS.items() if _teaches(type(learner), one)])
-
-
-def _teachers(model: Model) -> str:
-    return _choice(
-        "learner", [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
-    )
 
 
 def _choice(kind: str, names: list[str]) -> str:
@@ -329,19 +317,15 @@ def _check_information(
             raise mismatch(f"policy.refresh_every {policy.refresh_every}", what, given)
         return
     if model.structure != "gradient":
-        raise mismatch(what, _models("gradient"), f"model '{model.name}'")
+        fitting = [name for name, one in MODELS.items() if one.structure == "gradient"]
+        raise mismatch(what, _choice("model", fitting), f"model '{model.name}'")
     if learner.updates_information:
         raise mismatch(what, "a learner that leaves M to the policy", f"learner '{learner.name}'")
     q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
     form = policy.chosen_form(q, n_rows)
     if form != "primal":
-        expected = "policy.form 'primal' or 'auto'" if hasattr(policy, "form") else "form 'primal'"
-        found = f"policy.form '{form}'" if hasattr(policy, "form") else f"form '{form}'"
-        raise mismatch(what, expected, found)
-
-
-def _models(structure: str) -> str:
-    return _choice("model", [name for name, one in MODELS.items() if one.structure == structure])
+        whose, auto = ("policy.", " or 'auto'") if hasattr(policy, "form") else ("", "")
+        raise mismatch(what, f"{whose}form 'primal'{auto}", f"{whose}form '{form}'")
 
 
 def check_sampled(system: System, model: Model) -> None:

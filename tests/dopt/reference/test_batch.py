@@ -13,6 +13,7 @@ from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
 from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.models import uniform_inputs
+from dopt.spec.trial import TrialSpec
 from tests.dopt.custom_networks import for_one
 from tests.dopt.reference.test_reference import situation, sphere, step_from
 from tests.dopt.trials import KNOWN_EFFECT, PAIRS, covering, trial
@@ -58,29 +59,16 @@ def test_trials_of_two_configs_are_no_batch() -> None:
 
 @pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
 def test_any_module_is_explored(policy: str) -> None:
-    torch.manual_seed(0)
-    spec = trial("arm", policy, env={"horizon": 25}, learner={"learning_rate": 2e-2})
-    module = Residual(len(spec.system.features), spec.system.n_learned)
-    initial = nn.utils.parameters_to_vector(module.parameters()).detach().numpy()
-    result = run_trials([spec], module=module)[0]
+    shipped = trial("arm", policy, env={"horizon": 25}, learner={"learning_rate": 2e-2})
+    own = {"_target_": f"{Residual.__module__}.Residual"}
+    spec = TrialSpec.from_mapping(shipped.to_mapping() | {"model": own, "path": None})
+    initial, result = draw(spec).weights, run_trials([spec])[0]
     assert not result.diverged
     assert result.parameters.shape == initial.shape
     assert np.mean(result.parameters != initial) > 0.5  # units of a ReLU may be dead
-    assert np.array_equal(nn.utils.parameters_to_vector(module.parameters()).detach(), initial)
     norms = np.linalg.norm(result.inputs, axis=1)
     if policy != "random":
         assert norms == pytest.approx(spec.system.gamma)
-
-
-def test_the_registered_network_is_the_module_of_the_same_weights() -> None:
-    spec = trial("arm", "d_optimal", 3, env={"horizon": 10})
-    n_in, *_, n_out = spec.model.layer_sizes(spec.system)  # type: ignore[attr-defined]
-    hidden = [nn.Linear(n_in, 16), nn.Tanh(), nn.Linear(16, 16), nn.Tanh()]
-    module = nn.Sequential(*hidden, nn.Linear(16, n_out)).double()
-    nn.utils.vector_to_parameters(torch.tensor(draw(spec).weights), module.parameters())
-    own, registered = run_trials([spec], module=module)[0], run_trials([spec])[0]
-    assert own.inputs == pytest.approx(registered.inputs, rel=1e-8)
-    assert own.loss == pytest.approx(registered.loss, rel=1e-8)
 
 
 def test_information_is_the_prior_and_all_rows_after_each_learning_step() -> None:
