@@ -22,7 +22,7 @@ from orchestrate.errors import ExitCode, without_password
 from orchestrate.files import whole
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory
-from orchestrate.store.records import now, unpack
+from orchestrate.store.records import now, unpacked_trajectory
 from orchestrate.store.schema import OUTCOME_COLUMNS, trial
 
 if TYPE_CHECKING:
@@ -205,9 +205,7 @@ def _of_config(
 ) -> Iterator[tuple[int, str, Trajectory]]:
     """Yield (seed, status, trajectory) of a configuration; ``size`` of them are read at a time."""
     for rows in reader.batches(size, _TRAJECTORIES, config_key=config.config_key):
-        for seed, status, dtype, *packed in rows:
-            arrays = [unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)]
-            yield seed, status, Trajectory(*arrays)
+        yield from ((seed, status, unpacked_trajectory(*row)) for seed, status, *row in rows)
 
 
 def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:

@@ -41,9 +41,8 @@ from orchestrate.store.records import (
     Trajectory,
     TrialRow,
 )
-from orchestrate.store.results import Saved
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
-from orchestrate.store.store import LEASE_SECONDS, Store
+from orchestrate.store.store import LEASE_SECONDS, Saved, Store
 
 __all__ = [
     "CONFIG_COLUMNS",

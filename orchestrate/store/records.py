@@ -272,8 +272,7 @@ class Curves:
     diverged: npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Assessments:
+class Assessments(Curves):
     """Measure of all n finished trials of a configuration, after k numbers of steps.
 
     Attributes
@@ -283,11 +282,6 @@ class Assessments:
     values : (n, k) float64, NaN where it is not finite or a trial diverged before that step
     diverged : (n,) bool
     """
-
-    seeds: npt.NDArray[np.int64]
-    t: npt.NDArray[np.int64]
-    values: Array
-    diverged: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -303,8 +297,8 @@ class TrialRow(Outcome):
     error_message: str | None
 
 
-@dataclass(frozen=True)
-class LaunchRow:
+@dataclass(frozen=True, kw_only=True)
+class LaunchRow(LaunchRecord):
     """Launch that wrote to the database, and whether its process is alive.
 
     Attributes
@@ -320,15 +314,6 @@ class LaunchRow:
     alive: bool
     started: str
     ended: str | None
-    host: str
-    pid: int
-    argv: Sequence[str]
-    overrides: Sequence[str]
-    git_commit: str | None
-    git_dirty: bool | None
-    git_diff_hash: str | None
-    versions: Mapping[str, str]
-    fingerprint: Mapping[str, str] | None = None
 
     @property
     def kind(self) -> str:
@@ -367,6 +352,11 @@ class Trajectory:
     states: Array
     inputs: Array
     parameters: Array
+
+
+def unpacked_trajectory(dtype: str, *packed: Any) -> Trajectory:
+    """Return the arrays of a row: the type, and the shape and the bytes of each array."""
+    return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
 
 
 PAGE = 200

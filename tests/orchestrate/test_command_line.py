@@ -27,7 +27,7 @@ from orchestrate.runner import start
 from orchestrate.runner.start import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
 from orchestrate.store.backends.base import parse_url
-from orchestrate.store.backends.sqlite_engine import existing_path
+from orchestrate.store.backends.sqlite import existing_path
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.pages import commands
 from tests.paths import ROOT
