@@ -555,12 +555,10 @@ def explorations(reader: Reader) -> list[ExplorationRow]:
     if not rows:
         return []
     alive = {one.launch_id for one in reader.launches() if one.state == "running" and one.alive}
-    return [
-        ExplorationRow(
-            *row[:-1],
-            is_running=row.launch_id in alive
-            and row.status == "done"
-            and row.n_steps < row.horizon,
-        )
-        for row in rows
-    ]
+    found = []
+    for row in rows:
+        values = row._asdict()
+        is_saved = values.pop("launch_id") in alive
+        grows = is_saved and row.status == "done" and row.n_steps < row.horizon
+        found.append(ExplorationRow(**values, is_running=grows))
+    return found
