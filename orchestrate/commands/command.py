@@ -152,12 +152,7 @@ def table(
 
 def plain(text: str) -> Text:
     """Return the text with control characters escaped."""
-    return Text(
-        "".join(
-            char if char.isprintable() or char == "\n" else repr(char)[1:-1]
-            for char in text.expandtabs()
-        )
-    )
+    return Text(visible(text.expandtabs()))
 
 
 def add_filters(parser: argparse.ArgumentParser) -> None:

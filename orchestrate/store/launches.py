@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import (
     ColumnElement,
@@ -31,7 +31,6 @@ from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.records import (
     Claim,
     LaunchRecord,
-    Registrable,
     Registration,
     not_before,
     now,
@@ -54,6 +53,9 @@ from orchestrate.store.schema import (
     trial,
 )
 from orchestrate.store.schema import launch as launch_table
+
+if TYPE_CHECKING:
+    from dopt.spec.trial import MarkedTrial, TrialSpec
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,7 @@ class Launches:
             self._backend.forget(one.token)
         return freed
 
-    def register(self, launch: int, specs: Iterable[Registrable]) -> Registration:
+    def register(self, launch: int, specs: Iterable[TrialSpec]) -> Registration:
         """Register a grid and return the state of its trials; repeated calls are harmless."""
         grid = GridRows(specs)
         with self._backend.transaction() as connection:
@@ -454,13 +456,13 @@ _BATCH_ROWS = 10_000
 class GridRows:
     """Distinct trials of a grid, as rows of the database."""
 
-    def __init__(self, specs: Iterable[Registrable]) -> None:
+    def __init__(self, specs: Iterable[TrialSpec | MarkedTrial]) -> None:
         self.trials: dict[str, tuple[str, int]] = {}  # trial_key -> config_key, seed
         self.configs: dict[str, dict[str, Any]] = {}
         for spec in specs:
             self._add(spec)
 
-    def _add(self, spec: Registrable) -> None:
+    def _add(self, spec: TrialSpec | MarkedTrial) -> None:
         config_key = spec.config_key
         known = self.configs.get(config_key)
         if known is None:
@@ -469,7 +471,7 @@ class GridRows:
         self.trials.setdefault(spec.trial_key, (known["config_key"], int(plain(spec.seed))))
 
 
-def _config_row(spec: Registrable) -> dict[str, Any]:
+def _config_row(spec: TrialSpec | MarkedTrial) -> dict[str, Any]:
     columns = spec.columns()
     if set(columns) != set(CONFIG_COLUMNS):
         raise ValueError(

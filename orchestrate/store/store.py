@@ -41,7 +41,6 @@ from orchestrate.store.records import (
     DTYPE,
     Array,
     Claim,
-    Registrable,
     finite,
     not_before,
     pack,
@@ -69,6 +68,7 @@ from orchestrate.store.schema import (
 
 if TYPE_CHECKING:
     from dopt.result import Assessment, TrialResult
+    from dopt.spec.trial import MarkedTrial
 
 
 LEASE_SECONDS = 60.0
@@ -185,7 +185,7 @@ class Store(Launches):
             ]
         return [outcome in (*FINISHED, "failed") for outcome in outcomes]
 
-    def holds_more(self, spec: Registrable, result: TrialResult) -> bool:
+    def holds_more(self, spec: MarkedTrial, result: TrialResult) -> bool:
         """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
         with self._backend.transaction() as connection:
             return _is_longer(connection, self._backend, spec, result)
@@ -193,7 +193,7 @@ class Store(Launches):
     def save(
         self,
         launch: int,
-        spec: Registrable,
+        spec: MarkedTrial,
         result: TrialResult,
         run: RunRecord,
         last: Saved | None = None,
@@ -527,7 +527,7 @@ def unpacked(row: Mapping[str, Any]) -> Path:
 
 
 def _is_longer(
-    connection: Connection, backend: Backend, spec: Registrable, result: TrialResult
+    connection: Connection, backend: Backend, spec: MarkedTrial, result: TrialResult
 ) -> bool:
     """Return True if the stored exploration has more steps; a fit is always written again whole.
 
@@ -564,7 +564,7 @@ def _is_mine(connection: Connection, last: Saved) -> bool:
 
 
 def _take(
-    connection: Connection, backend: Backend, launch_id: int, spec: Registrable, result: TrialResult
+    connection: Connection, backend: Backend, launch_id: int, spec: MarkedTrial, result: TrialResult
 ) -> Saved | None:
     """Begin an attempt at the trial, without steps; return None if more of it is stored."""
     register(connection, backend, launch_id, GridRows([spec]))
