@@ -11,9 +11,24 @@ if __name__ == "__main__":
     run("orchestrate.__main__")  # what cannot be imported is answered, too
 
 from dopt.errors import unknown_name
-from orchestrate.commands import COMMANDS
-from orchestrate.commands.command import PROGRAM, say
+from orchestrate.commands import PROGRAM, Command, design, export, maintenance, results, say, status
 from orchestrate.errors import ExitCode
+
+COMMANDS: tuple[Command, ...] = (
+    status.WORK_COMMAND,
+    status.STATUS_COMMAND,
+    results.SHOW_COMMAND,
+    maintenance.RETRY_COMMAND,
+    results.QUERY_COMMAND,
+    export.EXPORT_COMMAND,
+    maintenance.MERGE_COMMAND,
+    maintenance.DOCTOR_COMMAND,
+    maintenance.UPGRADE_COMMAND,
+    maintenance.BACKUP_COMMAND,
+    maintenance.PRUNE_COMMAND,
+    design.DESIGN_COMMAND,
+)
+"""In the order in which the help shows them."""
 
 
 @answered

@@ -16,10 +16,9 @@ import numpy.typing as npt
 
 from dopt import __version__
 from dopt.errors import DoptError
-from orchestrate.commands.command import Command, add_filters, answer, chosen
+from orchestrate.commands import Command, add_filters, answer, chosen
 from orchestrate.commands.results import counts
-from orchestrate.errors import ExitCode, without_password
-from orchestrate.files import whole
+from orchestrate.errors import ExitCode, whole, without_password
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory
 from orchestrate.store.records import now, unpacked_trajectory

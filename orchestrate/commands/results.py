@@ -21,7 +21,7 @@ from rich.text import Text
 
 from dopt.limits import VIOLATIONS, WORST
 from dopt.spec.config import completed
-from orchestrate.commands.command import (
+from orchestrate.commands import (
     Command,
     add_filters,
     chosen,

@@ -15,7 +15,7 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from orchestrate.commands.command import (
+from orchestrate.commands import (
     Command,
     add_filters,
     chosen,

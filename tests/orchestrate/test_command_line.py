@@ -20,8 +20,8 @@ from analysis.cli import parser as parser_of_analysis
 from dopt.errors import _say_once
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from orchestrate.__main__ import COMMANDS
 from orchestrate.__main__ import main as orchestrate
-from orchestrate.commands import COMMANDS
 from orchestrate.program import SUCCESSORS
 from orchestrate.runner import start
 from orchestrate.runner.start import Work
