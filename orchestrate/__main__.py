@@ -38,7 +38,12 @@ def main(words: Sequence[str] | None = None) -> int:
     if not given or given[0] in ("-h", "--help", "help"):
         say(overview())
         return ExitCode.DONE
-    return _run(given[0], given[1:])
+    name, *rest = given
+    commands = {command.name: command for command in COMMANDS}
+    if name not in commands:
+        check_removed(f"orchestrate {name}")
+        raise unknown_name("command", name, commands)
+    return commands[name].run(commands[name].parser().read(rest, mixed=True))
 
 
 def overview() -> str:
@@ -47,12 +52,3 @@ def overview() -> str:
     lines = [f"  {command.name:<{width}}  {command.help}" for command in COMMANDS]
     usage = f"Usage: {PROGRAM} COMMAND [--db URL] [--json] ..., or {PROGRAM} --version"
     return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help shows its options."])
-
-
-def _run(name: str, words: Sequence[str]) -> int:
-    commands = {command.name: command for command in COMMANDS}
-    if name not in commands:
-        check_removed(f"orchestrate {name}")
-        raise unknown_name("command", name, commands)
-    command = commands[name]
-    return command.run(command.parser().read(words, mixed=True))

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,8 @@ import numpy.typing as npt
 from dopt import __version__
 from dopt.errors import DoptError
 from orchestrate.commands import Command, add_filters, answer, chosen
-from orchestrate.commands.results import counts
-from orchestrate.errors import ExitCode, whole, without_password
+from orchestrate.commands.results import counts, public
+from orchestrate.errors import ExitCode, whole
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory
 from orchestrate.store.records import now, unpacked_trajectory
@@ -285,7 +285,7 @@ def provenance(
     """Return database, selection, configurations and launches, without passwords."""
     keys = {config.config_key for config in configs}
     writers = {row.launch_id for row in reader.rows(_WRITERS) if row.config_key in keys}
-    launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
+    launches = [public(one) for one in reader.launches() if one.launch_id in writers]
     return {
         "written": now(),
         "program": f"dopt {__version__}",
@@ -295,13 +295,8 @@ def provenance(
         "trials": dict(counts(configs)),
         "missing_values": "empty in csv, null in parquet: a loss that is not finite",
         "configs": {config.config_key: dict(config.config) for config in configs},
-        "launches": [_public(launch) for launch in launches],
+        "launches": launches,
     }
-
-
-def _public(launch: Mapping[str, Any]) -> dict[str, Any]:
-    words = {name: [*map(without_password, launch[name])] for name in ("argv", "overrides")}
-    return {**launch, **words}
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
