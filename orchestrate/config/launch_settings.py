@@ -254,7 +254,7 @@ def _place(store: Mapping[str, Any], part: Share | None) -> dict[str, Any]:
     return {"store_url": file, "collect_in": folder, "collect_seconds": every}
 
 
-def _lease_and_patience(lease: object, patience: object) -> dict[str, float]:
+def _lease_and_patience(lease: object, patience: object) -> dict[str, Any]:
     """Check that a launch gives up waiting for its database before its lease ends."""
     seconds = {
         "lease": amount("launch.lease", lease, "seconds"),

@@ -2,8 +2,8 @@
 
 :class:`Store` is the write side, used by launches; :class:`Reader` is the read side, used by the
 analysis. A trial is registered, claimed by one launch, and committed completely or rejected.
-What a command does to a whole database is in modules of their own: ``merge``,
-``doctor`` and ``maintenance``.
+What a command does to a whole database is in the modules ``merge`` and
+``maintenance``.
 """
 
 from __future__ import annotations

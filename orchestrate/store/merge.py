@@ -179,7 +179,10 @@ class Source:
             or expected not in (None, len(_of_all(assessments)))
         ):
             return None
-        packed = {name: _bytes(one) for name, one in trajectory.items()}
+        packed = {
+            name: bytes(one) if isinstance(one, memoryview) else one
+            for name, one in trajectory.items()
+        }
         return Curve(values[:, 1:], packed, assessments)
 
     def _has_its_key(self, row: Mapping[str, Any]) -> bool:
@@ -240,10 +243,6 @@ def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]
 def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
     """Return the assessments, (t, measure, value), that all trials of a configuration have."""
     return [tuple(one) for one in assessments if one[1] != SAMPLE_LOSS]
-
-
-def _bytes(value: Any) -> Any:
-    return bytes(value) if isinstance(value, memoryview) else value
 
 
 _COPIED = ("status", *OUTCOME_COLUMNS)

@@ -305,7 +305,8 @@ class Reader:
         Raises ``QueryError`` if the column or the configuration is unknown, and
         ``StoreUnavailableError`` if a step is missing.
         """
-        _check_column(column)
+        if column not in STEP_VALUES:
+            raise QueryError(f"A step has no column '{column}': {suggestion(column, STEP_VALUES)}")
         place = f"configuration {config_key[:12]} in {self.safe_url}"
         with self._snapshot() as connection:
             return read_curves(connection, *_config(connection, config_key), column, place)
@@ -416,11 +417,6 @@ def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:
         values=values,
         diverged=np.array([one == "diverged" for one in status.values()], dtype=np.bool_),
     )
-
-
-def _check_column(column: str) -> None:
-    if column not in STEP_VALUES:
-        raise QueryError(f"A step has no column '{column}': {suggestion(column, STEP_VALUES)}")
 
 
 def _config(connection: Connection, config_key: str) -> tuple[int, int]:
