@@ -151,6 +151,7 @@ def _write(
     reader: Reader, configs: Sequence[ConfigRow], wanted: Export, out: Path
 ) -> dict[str, Any]:
     import pyarrow as pa  # other commands do without it
+    from pyarrow import csv, parquet
 
     if wanted.kind == "trajectories":
         columns = _trajectory_columns(reader, configs)
@@ -159,9 +160,15 @@ def _write(
         columns, sql = _SELECTED[wanted.kind]
         tables = _selected(reader, configs, columns, sql)
     kinds = {name: pa.type_for_alias(kind) for name, kind in columns.items()}
-    write = {"csv": _write_csv, "parquet": _write_parquet}[wanted.format]
-    with closing(tables):  # after an error, before the database
-        rows = write(out, pa.schema(kinds), (_batch(kinds, *one) for one in tables))
+    schema, rows = pa.schema(kinds), 0
+    if wanted.format == "csv":
+        writer = csv.CSVWriter(out, schema)
+    else:
+        writer = parquet.ParquetWriter(out, schema, compression="zstd")
+    with closing(tables), writer:  # the tables after an error, before the database
+        for table in _large(schema, (_batch(kinds, *one) for one in tables)):
+            writer.write_table(table)
+            rows += table.num_rows
     return {"rows": rows, "columns": {name: str(kind) for name, kind in kinds.items()}}
 
 
@@ -233,33 +240,17 @@ def _batch(kinds: Mapping[str, pa.DataType], values: Mapping[str, Any], n: int) 
     return pa.RecordBatch.from_arrays(arrays, schema=pa.schema(kinds))
 
 
-def _write_csv(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> int:
-    """Write the rows, missing values empty; return how many."""
-    from pyarrow.csv import CSVWriter
-
-    n = 0
-    with CSVWriter(path, schema) as writer:
-        for batch in batches:
-            writer.write_batch(batch)
-            n += batch.num_rows
-    return n
-
-
-def _write_parquet(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> int:
-    """Write the rows, missing values null; return how many. Many small tables make a slow file."""
+def _large(schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield the rows in tables of many batches: small ones make a slow file of Parquet."""
     import pyarrow as pa
-    from pyarrow.parquet import ParquetWriter
 
-    n, waiting = 0, list[pa.RecordBatch]()
-    with ParquetWriter(path, schema, compression="zstd") as writer:
-        for batch in batches:
-            n += batch.num_rows
-            waiting.append(batch)
-            if sum(one.num_rows for one in waiting) >= 4 * ROWS:
-                writer.write_table(pa.Table.from_batches(waiting))
-                waiting = []
-        writer.write_table(pa.Table.from_batches(waiting, schema))
-    return n
+    waiting = list[pa.RecordBatch]()
+    for batch in batches:
+        waiting.append(batch)
+        if sum(one.num_rows for one in waiting) >= 4 * ROWS:
+            yield pa.Table.from_batches(waiting)
+            waiting = []
+    yield pa.Table.from_batches(waiting, schema)
 
 
 def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> None:

@@ -84,9 +84,6 @@ def _copy(parsed: URL, url: str, partial: Path) -> None:
         copy_checked(sqlite.existing_path(parsed), partial)
 
 
-SUFFIX = ".db"
-
-
 def collect(url: str, folder: Path) -> None:
     """Copy a SQLite database, which launches may be writing, to a file of its name in a folder.
 
@@ -113,7 +110,7 @@ def collect(url: str, folder: Path) -> None:
 
 
 def merge_collected(
-    url: str, folder: Path, pattern: str = f"*{SUFFIX}", trial_key: TrialKey | None = None
+    url: str, folder: Path, pattern: str = "*.db", trial_key: TrialKey | None = None
 ) -> Iterator[Merged]:
     """Merge the copies in a folder into a database, one after the other.
 
