@@ -455,8 +455,9 @@ class RayExecutor(Executor):
     ) -> None:
         self._run = run
         self._limits = limits
-        local = address == "local"
-        self._ray = OwnRay(workers) if local else Cluster(address, workers, prepare)
+        self._ray: OwnRay | Cluster = (
+            OwnRay(workers) if address == "local" else Cluster(address, workers, prepare)
+        )
         self._queue: deque[Sequence[Task]] = deque()
         self._chunks: dict[Any, Chunk] = {}
         self._lost = False
