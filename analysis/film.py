@@ -44,7 +44,7 @@ from dopt.systems import (
     UnbalancedDisk,
     VanDerPol,
 )
-from orchestrate.errors import whole
+from orchestrate.files import whole
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]

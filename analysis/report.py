@@ -51,7 +51,7 @@ from analysis.tables.variants import (
     verdict,
 )
 from dopt.policies import POLICIES
-from orchestrate.errors import make_folder
+from orchestrate.files import make_folder
 from orchestrate.program import path
 from orchestrate.store import Reader
 

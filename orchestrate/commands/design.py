@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orchestrate.commands import Command, answer
-from orchestrate.errors import ExitCode, whole
+from orchestrate.errors import ExitCode
+from orchestrate.files import whole
 from orchestrate.program import UsageError, integer, path, positive, tell
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from dopt import __version__
 from dopt.errors import DoptError
 from orchestrate.commands import Command, add_filters, answer, chosen
 from orchestrate.commands.results import counts, public
-from orchestrate.errors import ExitCode, whole
+from orchestrate.errors import ExitCode
+from orchestrate.files import whole
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory
 from orchestrate.store.records import now, unpacked_trajectory

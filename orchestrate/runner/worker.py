@@ -76,7 +76,7 @@ class Leave:
 def run_worker(
     url: str,
     output: Output,
-    work: Work = WORK,
+    work: Work | None = None,
     *,
     seconds: float | None = None,
     processes: int | None = None,
@@ -92,7 +92,8 @@ def run_worker(
     url
         Database, which exists.
     output, work
-        Destinations of messages, and functions that run a trial and prepare for it.
+        Destinations of messages, and functions that run a trial and prepare for it, by default
+        :data:`orchestrate.runner.start.WORK`.
     seconds
         Time after which nothing is held any more; None until no trial is left.
     processes
@@ -130,7 +131,7 @@ def run_worker(
             settings,
             record,
             output,
-            lambda store: _work(store, settings, seconds, work, output, start),
+            lambda store: _work(store, settings, seconds, work or WORK, output, start),
         )
 
 
