@@ -368,6 +368,10 @@ class MarkedTrial:
         text = f'{self.config_json[:-1]},"seed":{self.seed}}}'
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def columns(self) -> dict[str, str | int | float | None]:
+        """Return what a table of configurations shows in columns of its own."""
+        raise NotImplementedError
+
 
 def marked_json(content: Mapping[str, object]) -> str:
     """Return the canonical JSON of a marked configuration."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orchestrate.commands.command import Command, answer
+from orchestrate.commands import Command, answer
 from orchestrate.errors import ExitCode
 from orchestrate.files import whole
 from orchestrate.program import UsageError, integer, path, positive, tell

@@ -41,7 +41,7 @@ from orchestrate.store import (
     default_url,
     explorations,
 )
-from orchestrate.store import results as writing
+from orchestrate.store import store as writing
 from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
 from tests.dopt.explorer.plants import STEPS, content, drive, explorer

@@ -22,7 +22,7 @@ from dopt.systems.plant import Plant
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, StoreError, StoreUnavailableError
-from orchestrate.store import results as writing
+from orchestrate.store import store as writing
 from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
 from tests.analysis.synthetic import fill, make_grid

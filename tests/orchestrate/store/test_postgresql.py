@@ -21,7 +21,7 @@ from sqlalchemy import Engine, create_engine, text
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
-from orchestrate.store.backends import base, postgresql, sqlite_engine
+from orchestrate.store.backends import base, postgresql, sqlite
 from orchestrate.store.backends.base import is_transient
 from orchestrate.store.records import Array
 from tests.orchestrate.store.databases import execute, file_of, schema_of
@@ -202,7 +202,7 @@ ROW = "SELECT * FROM launch FOR UPDATE"
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Announce a wait after a fraction of the two seconds."""
-    for module in (base, sqlite_engine, postgresql):
+    for module in (base, sqlite, postgresql):
         monkeypatch.setattr(module, "ANNOUNCE_SECONDS", 0.2)
     monkeypatch.setattr(postgresql, "_WATCH_SECONDS", 0.05)
 
@@ -357,7 +357,7 @@ def test_a_free_file_is_locked_at_once(
         taken.append(seconds)
         return True
 
-    sqlite_engine.patiently(locked, patience, tmp_path, tmp_path)
+    sqlite.patiently(locked, patience, tmp_path, tmp_path)
     assert taken == [min(0.2, patience)]
     assert not warnings(caplog)
 
