@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
 from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.explorer import Explorer
-from dopt.kernel.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS, RFF, GaussianProcess
 from dopt.models.gaussian_process import kernel
@@ -25,7 +22,7 @@ from dopt.run import rerun, run_trial
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.kernel.twin import call, model_of_kernel
+from tests.dopt.kernel.twin import model_of_kernel
 from tests.dopt.oracles.traces import jacobian, observed, trace
 from tests.dopt.test_limits import ABSOLUTE, ANGLE, CART, DEGREE, JOINTS, sensed
 from tests.dopt.trials import trial
@@ -236,19 +233,8 @@ def test_learners_that_keep_something_of_one_network_are_refused(
         make(ENSEMBLE, learner=learner)
 
 
-ONE_FIT: dict[str, Any] = {"noise": "fitted", "refit_every": 60, "horizon": 60}
 
 
-def test_it_is_the_likeliest_of_its_neighbours() -> None:
-    fast = KernelTrial(sensed("pendulum", ANGLE, **ONE_FIT, noise_variance=3.0))
-    fast.advance(60)
-    noise, none = fast.state.estimate.noise_variance, np.empty((0, len(fast.state.theta)))
-    fitted, lowest = float(noise[0]), call(run_filter, fast.trial, 60, none, np.empty(0))
-    moves = abs(math.log10(fitted / 3.0)) / math.log10(NOISE_FACTORS[0])
-    assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
-    for factor in NOISE_FACTORS:
-        noise[0] = factor * fitted
-        assert call(run_filter, fast.trial, 60, none, np.empty(0)) >= lowest
 
 
 READERS = ("affine", "black_box")

@@ -35,7 +35,7 @@ from dopt.systems import (
 from dopt.systems.elementary import cos, magnitude, sign, sin, tanh, where
 from dopt.systems.pendulum import LARGEST_ROW
 from dopt.systems.properties import jacobians
-from tests.dopt.systems.mechanics import ChainMechanics, CoupledPendulumsMechanics
+from tests.dopt.systems.mechanics import MECHANICS
 from tests.dopt.systems.strategies import assert_compiled_equations_agree
 from tests.dopt.test_checks import broken_system
 
@@ -69,20 +69,9 @@ def test_a_tyre_never_pulls_harder_than_its_grip() -> None:
 CONSTANTS = {"mass": 0.7, "length": 0.6, "friction": 0.3}
 
 
-def point(system: Chain, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def point(system: System, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return rng.normal(size=system.n_states), rng.normal(size=system.n_inputs)
-
-
-@pytest.mark.parametrize("n_links", [1, 2, 3, 7])
-def test_a_chain_of_any_length_obeys_euler_and_lagrange(n_links: int) -> None:
-    chain = Chain(n_links=n_links, **CONSTANTS)
-    for seed in range(5):
-        x, u = point(chain, seed)
-        expected = ChainMechanics(chain).accelerations(torch.tensor(x), torch.tensor(u)).numpy()
-        flow = chain.derivative(x, u)
-        assert flow[1::2] == pytest.approx(expected, rel=1e-9, abs=1e-9)
-        assert np.array_equal(flow[::2], x[1::2])
 
 
 def test_a_chain_of_two_links_is_an_arm() -> None:
@@ -128,14 +117,21 @@ def test_links_without_number_are_refused() -> None:
         Chain(n_links=2, initial_state=(0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_a_row_of_any_length_obeys_euler_and_lagrange(n: int) -> None:
-    row, rng = CoupledPendulums(n_pendulums=n, gravity=2.0, coupling=3.0), np.random.default_rng(n)
-    for _ in range(5):
-        x, u = rng.normal(size=2 * n), rng.normal(size=1)
-        mechanics = CoupledPendulumsMechanics(row)
+@pytest.mark.parametrize(
+    "system",
+    [
+        *(Chain(n_links=n, **CONSTANTS) for n in (1, 2, 3, 7)),
+        *(CoupledPendulums(n_pendulums=n, gravity=2.0, coupling=3.0) for n in (1, 2, 5)),
+    ],
+)
+def test_chains_and_rows_of_any_length_obey_euler_and_lagrange(system: System) -> None:
+    mechanics = MECHANICS[system.name](system)
+    for seed in range(5):
+        x, u = point(system, seed)
         expected = mechanics.accelerations(torch.tensor(x), torch.tensor(u)).numpy()
-        assert row.derivative(x, u)[1::2] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        flow = system.derivative(x, u)
+        assert flow[1::2] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert np.array_equal(flow[::2], x[1::2])
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
@@ -359,41 +355,25 @@ def test_every_shipped_system_has_a_rigid_body(name: str) -> None:
         np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape))
 
 
-def test_a_pendulum_hangs_at_rest_and_swings_to_the_right() -> None:
-    tips = body_of(Pendulum(length=2.0), np.array([[0.0, 0.0], [np.pi / 2, 0.0]])).masses[:, 0]
-    np.testing.assert_allclose(tips, [[0, -2], [2, 0]], atol=1e-12)
-
-
-def test_the_height_of_a_mass_is_its_potential_energy() -> None:
-    """The weight times the height is the energy whose slope the equations feel."""
-    system, eps = Pendulum(friction=0.0), 1e-6
-    angles = np.linspace(-3, 3, 20)
-    up, down = (
-        body_of(system, np.stack([angles + sign * eps, 0 * angles], axis=1)).masses[:, 0, 1]
-        for sign in (1, -1)
-    )
-    slope = system.mass * system.gravity * (up - down) / (2 * eps) / 2  # the rod's middle
-    inertia = system.mass * system.length**2 / 3
-    accelerations = system.learned(np.stack([angles, 0 * angles], axis=1))[:, 0]
-    np.testing.assert_allclose(-slope / inertia, accelerations, rtol=1e-6)
-
-
-def test_a_pole_stands_upright_at_zero_and_leans_to_the_right() -> None:
-    at = np.array([[1.0, 0, 0, 0], [1.0, 0, np.pi / 2, 0]])
-    np.testing.assert_allclose(body_of(Cartpole(), at).masses[:, 0], [[1, 1], [2, 0]], atol=1e-12)
-
-
-def test_an_arm_has_absolute_angles() -> None:
-    hand = body_of(Arm(), np.array([[np.pi / 2, 0, 0.0, 0]])).masses[0, 1]
-    np.testing.assert_allclose(hand, [1, -1], atol=1e-12)
+@pytest.mark.parametrize(
+    ("system", "at", "masses"),
+    [
+        (Pendulum(length=2.0), [[0.0, 0], [np.pi / 2, 0]], [[[0, -2]], [[2, 0]]]),
+        (Cartpole(), [[1.0, 0, 0, 0], [1.0, 0, np.pi / 2, 0]], [[[1, 1]], [[2, 0]]]),
+        (Arm(), [[np.pi / 2, 0, 0.0, 0]], [[[1, 0], [1, -1]]]),
+        (
+            MassSpring(),
+            [[0.0, 1, 0, 2], [0.5, 0, -0.5, 0]],
+            [[[-1, 0], [1, 0]], [[-0.5, 0], [0.5, 0]]],
+        ),
+    ],
+)
+def test_masses_are_drawn_where_they_are(system: System, at: Any, masses: Any) -> None:
+    """A pendulum hangs at rest, a pole stands, and the links of an arm have absolute angles."""
+    np.testing.assert_allclose(body_of(system, np.array(at)).masses, masses, atol=1e-12)
 
 
 def test_a_quadrotor_tilts_its_right_side_up() -> None:
     (bar,) = body_of(Quadrotor(), np.array([[3.0, 0, 4.0, 0, 0.1, 0]])).lines
     assert bar[0, 1, 1] > 4.0 > bar[0, 0, 1]
     np.testing.assert_allclose(bar[0].mean(axis=0), [3, 4])
-
-
-def test_masses_between_springs_move_along_a_level_line() -> None:
-    found = body_of(MassSpring(), np.array([[0.0, 1.0, 0.0, 2.0], [0.5, 0.0, -0.5, 0.0]])).masses
-    np.testing.assert_allclose(found, [[[-1, 0], [1, 0]], [[-0.5, 0], [0.5, 0]]])

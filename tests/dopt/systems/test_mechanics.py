@@ -34,36 +34,21 @@ from dopt.systems import (
 from dopt.systems.base import INTEGRATORS, next_state
 from dopt.systems.properties import eigenmode, euler_spectral_radius, jacobians
 from tests.dopt.kernel.twin import call, relative_gap
-from tests.dopt.systems.mechanics import (
-    FRICTION,
-    HOVERING,
-    MECHANICS,
-    SELF_EXCITED,
-    WITHOUT_INERTIA,
-    Mechanics,
-)
+from tests.dopt.systems.mechanics import MECHANICS, WITHOUT_INERTIA, Mechanics
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems
 from tests.dopt.trials import trial
 from tests.pages import PAGES
 from tests.paths import CONF
 
-closed = pytest.mark.parametrize("name", sorted(set(FRICTION) - set(HOVERING)))
-mechanical = pytest.mark.parametrize("name", [n for n in NAMES if SYSTEMS[n] in MECHANICS])
+mechanical = pytest.mark.parametrize("name", sorted(MECHANICS))
 
 
 def mechanics_of(system: System) -> Mechanics:
-    return MECHANICS[type(system)](system)
-
-
-def energy_rate(system: System, state: np.ndarray, flow: np.ndarray) -> tuple[float, float]:
-    """Return dE/dt along the flow and the size of the terms that it is the sum of."""
-    slope = torch.func.grad(mechanics_of(system).energy)(torch.tensor(state)).numpy()
-    return float(slope @ flow), float(np.abs(slope) @ np.abs(flow))
+    return MECHANICS[system.name](system)
 
 
 def test_every_registered_system_with_inertia_is_held_against_masses() -> None:
-    held = {name for name in NAMES if SYSTEMS[name] in MECHANICS}
-    assert held == set(FRICTION) == set(NAMES) - set(WITHOUT_INERTIA)
+    assert set(MECHANICS) == set(NAMES) - set(WITHOUT_INERTIA)
 
 
 @mechanical
@@ -72,30 +57,11 @@ def test_every_registered_system_with_inertia_is_held_against_masses() -> None:
 def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
     x, u = data.draw(states(name)), data.draw(inputs(name))
-    rate, size = energy_rate(system, x, system.derivative(x, u))
-    power = float(mechanics_of(system).power(torch.tensor(x), torch.tensor(u)))
-    assert rate == pytest.approx(power, abs=1e-12 * (1.0 + size))
-
-
-@closed
-@settings(max_examples=5)
-@given(data=st.data())
-def test_nothing_is_gained_or_lost_without_friction_and_input(
-    name: str, data: st.DataObject
-) -> None:
-    system = data.draw(systems(name, **dict.fromkeys(FRICTION[name], 0.0)))
-    x = data.draw(states(name))
-    rate, size = energy_rate(system, x, system.derivative(x, np.zeros(system.n_inputs)))
-    assert rate == pytest.approx(0.0, abs=1e-12 * (1.0 + size))
-
-
-@pytest.mark.parametrize("name", sorted(set(FRICTION) - {*SELF_EXCITED, *HOVERING}))
-@settings(max_examples=5)
-@given(data=st.data())
-def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
-    system, x = data.draw(systems(name)), data.draw(states(name))
-    rate, size = energy_rate(system, x, system.derivative(x, np.zeros(system.n_inputs)))
-    assert rate <= 1e-12 * (1.0 + size)
+    flow, mechanics = system.derivative(x, u), mechanics_of(system)
+    slope = torch.func.grad(mechanics.energy)(torch.tensor(x)).numpy()
+    power = float(mechanics.power(torch.tensor(x), torch.tensor(u)))
+    size = np.abs(slope) @ np.abs(flow)
+    assert slope @ flow == pytest.approx(power, abs=1e-12 * (1.0 + size))
 
 
 @mechanical
@@ -207,7 +173,7 @@ def shipped(name: str) -> System:
 
 def energies(system: System, states: np.ndarray) -> np.ndarray:
     """Return the energies, (...,) [J], of states, (..., d), beyond that at rest."""
-    energy = torch.func.vmap(MECHANICS[type(system)](system).energy)
+    energy = torch.func.vmap(mechanics_of(system).energy)
     rest = system.equilibrium or system.initial_state
     rows = torch.tensor(np.vstack([states.reshape(-1, system.n_states), rest]))
     values = energy(rows).numpy()
