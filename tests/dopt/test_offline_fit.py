@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
-from torch.func import jacrev, vmap
 
 from dopt import Explorer
 from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
@@ -37,11 +35,11 @@ from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, CoupledPendulums
 from dopt.types import Array
-from tests.dopt.custom_networks import model_of_one
 from tests.dopt.explorer.plants import following
 from tests.dopt.explorer.test_measurements import ENCODER, JOINT
 from tests.dopt.kernel.twin import interpreted, observed
 from tests.dopt.oracles.test_oracles import filtered
+from tests.dopt.oracles.traces import jacobian as complex_jacobian
 from tests.dopt.oracles.traces import model_step
 from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, measures, sensed
 from tests.dopt.trials import trial
@@ -59,13 +57,6 @@ def taught(spec: TrialSpec, states: Array) -> tuple[Array, Array]:
     """Return the parameters of another network of the same shape, and its accelerations."""
     theta = initial_weights(spec.with_seed(spec.seed + 1))
     return theta, spec.model.predict(spec.system, theta, states)
-
-
-def torch_jacobian(spec: TrialSpec, theta: Array, states: Array) -> Array:
-    """Return ∂a_θ(x)/∂θ, (N r, q), by automatic differentiation."""
-    model = model_of_one(spec.system, spec.model)
-    rows = vmap(jacrev(model), in_dims=(None, 0))(torch.tensor(theta), torch.tensor(states))
-    return rows.flatten(0, 1).numpy()
 
 
 @pytest.mark.parametrize("env", ["pendulum", "arm"])
@@ -92,7 +83,7 @@ def test_a_fit_ends_at_a_minimum_of_its_objective(env: str, ridge: float) -> Non
     samples = uniform_samples(spec)
     fitted = fit_offline(spec, samples.states, samples.accelerations, ridge=ridge)
     theta, prior = fitted.parameters, initial_weights(spec)
-    J = torch_jacobian(spec, theta, samples.states)
+    J = complex_jacobian(spec, theta, samples.states).reshape(-1, len(theta))
     e = (samples.accelerations - spec.model.predict(spec.system, theta, samples.states)).ravel()
     slope = J.T @ e + ridge * (prior - theta)
     value = e @ e + ridge * np.sum((theta - prior) ** 2)
@@ -118,9 +109,8 @@ def test_each_network_of_an_ensemble_is_fitted_by_itself() -> None:
     for member, start in zip(others, drawn[1:], strict=True):
         assert not np.allclose(member, first)
         e = samples.accelerations - spec.model.predict(spec.system, member, samples.states)
-        slope = torch_jacobian(spec, member, samples.states).T @ e.ravel() + RIDGE * (
-            start - member
-        )
+        J = complex_jacobian(spec, member, samples.states).reshape(-1, len(member))
+        slope = J.T @ e.ravel() + RIDGE * (start - member)
         assert np.linalg.norm(slope) < 1e-2 * np.linalg.norm(start - member)
 
 
@@ -165,6 +155,17 @@ def test_a_model_without_an_offline_fit_is_refused() -> None:
     grey = trial("pendulum", "random", 1, model={"name": "grey_box"}, learner={"name": "ekf"})
     with pytest.raises(SpecificationError, match=r"model 'grey_box' has no offline fit, but 'mlp'"):
         fit_offline(grey, np.zeros((60, 2)), np.zeros((60, 1)))
+
+
+def test_fixed_parameters_of_a_linear_model_stay() -> None:
+    model = {"name": "rff", "n_features": 30}
+    learner = {"name": "recursive_least_squares"}
+    spec = trial("pendulum", "random", 1, model=model, learner=learner, env={"horizon": 100})
+    samples = uniform_samples(spec)
+    fitted = fit_offline(spec, samples.states, samples.accelerations)
+    fixed = spec.model.n_fixed_parameters(spec.system)
+    assert np.array_equal(fitted.parameters[-fixed:], initial_weights(spec)[-fixed:])
+    assert fitted.loss < 0.2 * grid_loss(spec, initial_weights(spec))
 
 
 def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:
@@ -278,6 +279,9 @@ def test_systems_whose_loss_is_no_parameter_error_are_refused() -> None:
     uneven = CoupledPendulums(n_pendulums=2, grid_half_widths=(1.0, 1.1))
     with pytest.raises(SpecificationError, match=r"dopt\.run"):
         loss_by_parameter_error(uneven)
+    object.__setattr__(uneven, "linear_parameters", ())
+    with pytest.raises(SpecificationError, match="no parameters that its accelerations are linear"):
+        true_parameters(uneven)
     even = dataclasses.replace(uneven, grid_half_widths=(1.0,))
     assert loss_by_parameter_error(even) == pytest.approx(1 / 3**0.5, rel=1e-3)
 
@@ -353,11 +357,10 @@ def test_the_information_after_a_fit_is_in_the_derivatives_of_the_innovations() 
     )
 
 
-@pytest.mark.parametrize("begun", [3.0])
-def test_a_fitted_noise_is_the_likeliest_of_its_neighbours(begun: float) -> None:
-    fast = after_fit(60, noise="fitted", noise_variance=begun)
+def test_a_fitted_noise_is_the_likeliest_of_its_neighbours() -> None:
+    fast = after_fit(60, noise="fitted", noise_variance=3.0)
     fitted, theta = float(fast.state.estimate.noise_variance[0]), fast.state.theta.copy()
-    moves = abs(math.log10(fitted / begun)) / math.log10(NOISE_FACTORS[0])
+    moves = abs(math.log10(fitted / 3.0)) / math.log10(NOISE_FACTORS[0])
     assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
     lowest, *others = (
         innovations(fast, theta, factor * fitted).unlikelihood for factor in (1.0, *NOISE_FACTORS)
@@ -401,6 +404,13 @@ def test_the_log_loss_of_a_linear_model_is_lowest_with_the_covariance_of_the_noi
             fit = held_out_fit(dataclasses.replace(spec, config=judged), *given)
             values.append(fit.grid.log_loss)
     assert sum(found[1.0]) < min(sum(found[0.2]), sum(found[5.0]))
+
+
+def test_jacobians_are_those_of_complex_steps() -> None:
+    spec = trial("cartpole", "random")
+    theta, states = initial_weights(spec), evaluation_set(spec.system).states
+    expected = complex_jacobian(spec, theta, states)
+    assert jacobian(spec, theta, evaluated(spec)) == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
 def test_r_squared_is_one_for_the_truth_and_falls_with_the_error() -> None:
