@@ -28,7 +28,7 @@ from dopt.limits import VIOLATIONS, WORST
 from dopt.offline_fit import fit_offline, recorded_samples, sample_loss
 from dopt.policies import PeriodicSquare
 from dopt.result import TrialResult
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.config import REACHABLE_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Cartpole, Pendulum
@@ -75,6 +75,9 @@ def test_pieces_and_repetition_change_nothing(
     monkeypatch.setattr(run, "FIRST_STEPS", 3)
     monkeypatch.setattr(run, "PIECE_SECONDS", 1e-9)
     assert run_trial(short("pendulum", "d_optimal")).assessments == done.assessments
+    again = rerun(short("pendulum", "d_optimal"), [10, 30])
+    np.testing.assert_array_equal(done.checkpoints[10], again.parameters[0])
+    np.testing.assert_array_equal(done.checkpoints[30], done.parameters)
 
 
 def test_exploration_does_not_notice_that_and_when_it_is_assessed(done: TrialResult) -> None:
