@@ -20,6 +20,7 @@ from dopt.policies import (
     Search,
     TaskOptimal,
 )
+from dopt.policies.base import on_sphere
 from dopt.randomness import draw
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -36,6 +37,52 @@ from tests.dopt.oracles.traces import (
     trace,
 )
 from tests.dopt.trials import trial
+
+# The two policies of the paper that plan: every input of the sphere is tried
+
+
+def of_the_sphere(spec: TrialSpec) -> Array:
+    """Return inputs of norm γ, (N, m): both there are, or many in random directions."""
+    m = spec.system.n_inputs
+    drawn = np.random.default_rng(0).standard_normal((2000, m)) if m > 1 else [[1.0], [-1.0]]
+    return on_sphere(np.array(drawn), spec.system.gamma)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "oracle"])
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_no_input_has_a_larger_linearised_gain(env: str, policy: str) -> None:
+    """Of uᵀQu - 2vᵀu, Q = (DB)ᵀM⁻¹DB and v = -(DB)ᵀM⁻¹g, with D and B by central differences."""
+    small: dict[str, Any] = {"model": {"width": 3}} if policy == "d_optimal" else {}
+    spec = trial(env, policy, 3, env={"horizon": 10}, policy={"regularization": 0.1}, **small)
+    run, inputs, m = trace(spec), of_the_sphere(spec), spec.system.n_inputs
+    for t in (1, 4, 9):
+        theta, component = run.parameters[t], draw(spec).components[t]
+        bar = model_step(spec, theta, run.states[t], np.zeros(m))
+        ends = [[model_step(spec, theta, bar, s * e) for e in np.eye(m)] for s in (1, -1)]
+        moves = 1e-5 * (np.array(ends[0]) - ends[1]) / 2
+        ahead, behind = (jacobian(spec, theta, bar + s * moves)[:, component] for s in (1, -1))
+        DB, g = (ahead - behind).T / 2e-5, jacobian(spec, theta, bar[None])[0, component]
+        solved = np.linalg.solve(information(spec, run, t, 0.1), np.column_stack([DB, g]))
+        Q, v = DB.T @ solved[:, :m], -DB.T @ solved[:, m]
+        tried = np.concatenate([run.inputs[t : t + 1], inputs])
+        chosen, *others = np.einsum("ni,ij,nj->n", tried, Q, tried) - 2 * tried @ v
+        assert chosen >= max(others) - 1e-6 * np.ptp(others)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_no_input_of_the_uniform_policy_leads_farther(env: str) -> None:
+    """From all states seen; an ascent may lose a little of the whole range."""
+    spec = trial(env, "uniform", 2, env={"horizon": 20}, model={"width": 3})
+    run, inputs = trace(spec), of_the_sphere(spec)[:200]
+    for t in (1, 7, 19):
+        ends = [
+            model_step(spec, run.parameters[t], run.states[t], u) for u in (run.inputs[t], *inputs)
+        ]
+        apart = np.linalg.norm(np.array(ends)[:, None] - run.states[None, : t + 1], axis=-1)
+        chosen, *others = apart.sum(axis=1)
+        margin = 1e-12 * chosen if spec.system.n_inputs == 1 else 1e-3 * np.ptp(others)
+        assert chosen >= max(others) - margin
+
 
 # Searching policies: every plan rolled out, and scored by the determinants of whole matrices.
 
