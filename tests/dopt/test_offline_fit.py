@@ -29,7 +29,6 @@ from dopt.offline_fit import (
     recorded_samples,
 )
 from dopt.randomness import draw, initial_weights
-from dopt.result import TrialResult
 from dopt.run import rerun, run_trial
 from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
@@ -41,7 +40,7 @@ from tests.dopt.kernel.twin import interpreted, observed
 from tests.dopt.oracles.test_oracles import filtered
 from tests.dopt.oracles.traces import jacobian as complex_jacobian
 from tests.dopt.oracles.traces import model_step
-from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, measures, sensed
+from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, sensed
 from tests.dopt.trials import trial
 from tests.dopt.uniform import uniform_samples
 
@@ -184,18 +183,6 @@ def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:
     assert fitted.loss < grid_loss(spec, initial_weights(spec))
 
 
-def limited(
-    limits: dict[str, Any] | None, policy: str = "d_optimal", /, *, horizon: int = 20,
-    seed: int = 0, learner: str = "joint_ekf", **env: Any,
-) -> TrialSpec:  # fmt: skip
-    """Return a trial of the cartpole of which angle and place are measured."""
-    spec = sensed(
-        "cartpole", CART | env, learner, policy, horizon=horizon, seed=seed,
-        **({"refit_every": 1000} if learner == "joint_ekf" else {}),
-    )  # fmt: skip
-    return TrialSpec.from_mapping(spec.to_mapping() | {"limits": limits})
-
-
 def test_variances_are_those_of_state_and_parameters_in_one_filter() -> None:
     sensors = {"measured_states": [0], "measurement_noise": [DEGREE]}
     fast = KernelTrial(sensed("pendulum", sensors, horizon=13, refit_every=1000))
@@ -203,25 +190,6 @@ def test_variances_are_those_of_state_and_parameters_in_one_filter() -> None:
     expected = filtered(fast.spec, fast.state.estimate.outputs[:12], fast.record.inputs[:12])[2]
     found = interpreted(joint_kalman.state_variances)(fast.trial, 12)
     np.testing.assert_allclose(found, expected[:2], rtol=1e-3)
-
-
-def beyond(result: TrialResult) -> float:
-    """Return the share of the steps after which the true cart is beyond its rail."""
-    return float(np.mean(np.abs(result.states[1:, 0]) > 2.0))
-
-
-def test_the_true_cart_stays_on_its_rail() -> None:
-    """Counted on the true states: without limits it leaves the rail, without a margin also."""
-    free, bare = (
-        run_trial(limited(RAIL | given, horizon=300))
-        for given in ({"enforced": False}, {"margin": 0.0})
-    )
-    kept = [run_trial(limited(RAIL, horizon=300, seed=seed)) for seed in range(2)]
-    assert beyond(free) > 0.5
-    assert sum(map(beyond, kept)) <= 0.01 * 2
-    assert beyond(kept[0]) < beyond(bare)
-    for result in (free, bare, *kept):
-        assert measures(result)["violations"] == pytest.approx(300 * beyond(result))
 
 
 def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
@@ -247,11 +215,10 @@ def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None
 
 def test_limits_of_filtered_differences_are_refused() -> None:
     """Nothing says how uncertain these are; limits that are counted alone need no such thing."""
-    with pytest.raises(
-        IncompatibleError, match="which knows how uncertain its estimates are, but l"
-    ):
-        limited(RAIL, learner="adam_window")
-    limited(RAIL | {"enforced": False}, learner="adam_window")
+    mapping = sensed("cartpole", CART, "adam_window").to_mapping()
+    TrialSpec.from_mapping(mapping | {"limits": RAIL | {"enforced": False}})
+    with pytest.raises(IncompatibleError, match="which knows how uncertain its estimates are"):
+        TrialSpec.from_mapping(mapping | {"limits": RAIL})
 
 
 def test_the_loss_of_coupled_pendulums_is_their_parameter_error_times_a_constant() -> None:

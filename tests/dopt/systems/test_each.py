@@ -94,23 +94,16 @@ def test_a_hanging_chain_swings_at_the_zeros_of_a_laguerre_polynomial(n_links: i
     assert squares == pytest.approx(zeros * 10.0 / 0.6, rel=1e-6)
 
 
-@pytest.mark.parametrize("n_links", [1, 3, 5])
-def test_compiled_equations_are_those_of_a_chain_of_that_length(n_links: int) -> None:
-    chain = Chain(n_links=n_links, **CONSTANTS)
-    assert_compiled_equations_agree(chain, *point(chain, 1))
-
-
 def test_what_depends_on_the_number_of_links_follows_it() -> None:
+    """Also what is compiled."""
     chain = Chain(n_links=3, initial_state=(0.1, 0.2), grid_half_widths=(1, 2, 3, 4, 5, 6))
+    assert_compiled_equations_agree(chain, *point(chain, 1))
     assert (chain.n_states, chain.n_inputs, chain.n_learned) == (6, 3, 3)
     assert chain.initial_state == (0.1, 0.2) * 3
     assert chain.features[-1] == Feature("identity", 5)
     assert chain.feature_scales == (1, 1, 2, 1, 1, 4, 1, 1, 6)
     assert dataclasses.replace(chain) == chain
     assert Chain.learned_rows == Chain().learned_rows == (1, 3, 5, 7, 9)
-
-
-def test_links_without_number_are_refused() -> None:
     with pytest.raises(SpecificationError, match=r"n_links is 101, .* at most 100"):
         Chain(n_links=101)
     with pytest.raises(SpecificationError, match=r"initial_state has 3 entries, but chain needs 4"):
@@ -150,13 +143,6 @@ def test_the_longest_row_loses_energy_in_every_mode_under_the_euler_map() -> Non
     assert np.abs(np.linalg.eigvals(np.eye(row.n_states) + row.dt * A)).max() < 1.0
 
 
-def test_the_input_turns_the_first_pendulum_alone() -> None:
-    row = CoupledPendulums(n_pendulums=4)
-    x = np.random.default_rng(0).normal(size=8)
-    change = row.derivative(x, [2.0]) - row.derivative(x, [0.0])
-    assert change == pytest.approx([0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
 def test_an_upright_drone_hovers_and_one_upside_down_falls() -> None:
     drone = Drone()
     assert drone.derivative(drone.initial_state, np.zeros(4)) == pytest.approx(0.0, abs=1e-14)
@@ -165,6 +151,10 @@ def test_an_upright_drone_hovers_and_one_upside_down_falls() -> None:
     fall = drone.derivative(over, np.zeros(4))
     assert fall[5] == pytest.approx(-2.0 * drone.gravity)
     assert np.delete(fall, 5) == pytest.approx(0.0, abs=1e-14)
+    # Drag balances the fall at the terminal speed, ρ √(v² + v₀²) v = 2 m g.
+    square, weight = drone.slow_speed**2, 2.0 * drone.mass * drone.gravity / drone.drag
+    over[5] = -np.sqrt((np.sqrt(square**2 + 4.0 * weight**2) - square) / 2.0)
+    assert drone.derivative(over, np.zeros(4))[5] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_euler_steps_keep_the_norm_of_the_quaternion() -> None:
@@ -174,17 +164,6 @@ def test_euler_steps_keep_the_norm_of_the_quaternion() -> None:
     path = simulate(drone, drone.gamma * inputs)
     assert np.abs(path[..., 10:]).max() > 2.0, "it turns"
     assert np.linalg.norm(path[..., 6:10], axis=-1) == pytest.approx(1.0, abs=0.01)
-
-
-def test_drag_balances_a_fall_at_the_terminal_speed() -> None:
-    """ρ √(v² + v₀²) v = 2 m g for a drone that falls upside down."""
-    drone = Drone()
-    square = drone.slow_speed**2
-    weight = 2.0 * drone.mass * drone.gravity / drone.drag
-    speed = np.sqrt((np.sqrt(square**2 + 4.0 * weight**2) - square) / 2.0)
-    state = np.zeros(13)
-    state[5], state[7] = -speed, 1.0
-    assert drone.derivative(state, np.zeros(4))[5] == pytest.approx(0.0, abs=1e-12)
 
 
 Function = Callable[[Any], Any]
@@ -278,30 +257,6 @@ def test_equations_that_do_not_compile_are_refused_in_a_sentence() -> None:
     assert "unknown_to_the_compiler of test_each.py" in message
     assert "\n" not in message
     assert len(message) < 500
-
-
-def damped_mass(star: MovingStar, friction: float, dt: float, forces: np.ndarray) -> np.ndarray:
-    """Return the positions of a mass of 1 kg, q̈ = F + u - α q̇, by the Euler map."""
-    at, velocity = np.array(star.initial_state), np.zeros(2)
-    positions = [at]
-    for t, force in enumerate(forces):
-        push = star.friction * star.learned(at[None], t)[0]
-        at, velocity = at + dt * velocity, velocity + dt * (push + force - friction * velocity)
-        positions.append(at)
-    return np.array(positions)
-
-
-def test_a_step_is_that_of_the_mass_in_flex_one_step_earlier() -> None:
-    """With α dt = 1 a velocity has no memory. Their force is that where the mass was before."""
-    star = MovingStar(period=1e6, horizon=60)
-    rng = np.random.default_rng(0)
-    forces = 50.0 * rng.normal(size=(60, 2))
-    expected = damped_mass(star, friction=100.0, dt=0.01, forces=forces)
-    at = np.array(star.initial_state)
-    for t, force in enumerate(forces):
-        assert at == pytest.approx(expected[t + 1], abs=1e-4)
-        at = at + star.dt * star.derivative(at, force, t)
-    assert np.linalg.norm(at - np.array(star.initial_state)) > 0.02
 
 
 def test_the_force_points_away_from_the_star_and_falls_to_half_at_its_radius() -> None:
