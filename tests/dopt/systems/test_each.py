@@ -259,6 +259,30 @@ def test_equations_that_do_not_compile_are_refused_in_a_sentence() -> None:
     assert len(message) < 500
 
 
+def damped_mass(star: MovingStar, friction: float, dt: float, forces: np.ndarray) -> np.ndarray:
+    """Return the positions of a mass of 1 kg, q̈ = F + u - α q̇, by the Euler map."""
+    at, velocity = np.array(star.initial_state), np.zeros(2)
+    positions = [at]
+    for t, force in enumerate(forces):
+        push = star.friction * star.learned(at[None], t)[0]
+        at, velocity = at + dt * velocity, velocity + dt * (push + force - friction * velocity)
+        positions.append(at)
+    return np.array(positions)
+
+
+def test_a_step_is_that_of_the_mass_in_flex_one_step_earlier() -> None:
+    """With α dt = 1 a velocity has no memory. Their force is that where the mass was before."""
+    star = MovingStar(period=1e6, horizon=60)
+    rng = np.random.default_rng(0)
+    forces = 50.0 * rng.normal(size=(60, 2))
+    expected = damped_mass(star, friction=100.0, dt=0.01, forces=forces)
+    at = np.array(star.initial_state)
+    for t, force in enumerate(forces):
+        assert at == pytest.approx(expected[t + 1], abs=1e-4)
+        at = at + star.dt * star.derivative(at, force, t)
+    assert np.linalg.norm(at - np.array(star.initial_state)) > 0.02
+
+
 def test_the_force_points_away_from_the_star_and_falls_to_half_at_its_radius() -> None:
     star = MovingStar(radius=0.3, strength=2.0, friction=4.0, core=1e-6)
     centre = np.array([star.orbit, 0.0])
