@@ -115,13 +115,6 @@ def test_a_system_and_a_policy_of_ones_own_run_and_are_stored_by_name() -> None:
     assert np.abs(result.inputs).max() <= spec.system.gamma
 
 
-@pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
-def test_the_kernel_agrees_with_the_reference_on_it(policy: str) -> None:
-    spec = specification(policy={"name": policy})
-    fast, plain = run_trial(spec), run_trial(spec, path="reference")
-    np.testing.assert_allclose(fast.states, plain.states, rtol=1e-6, atol=1e-9)
-
-
 def test_another_state_of_the_file_is_another_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

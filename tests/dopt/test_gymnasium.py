@@ -100,17 +100,6 @@ def test_transitions_of_a_black_box_show_its_accelerations() -> None:
     np.testing.assert_allclose(points.accelerations, -DRAG * points.states[:, 1:], atol=1e-5)
 
 
-@pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
-def test_every_policy_explores_a_black_box(policy: str) -> None:
-    result = run_trial(specification(policy=policy, horizon=150))
-    assert result.diverged_at is None
-    assert result.loss[-1] < 0.5 * result.loss[0]
-    assert np.abs(result.inputs).max() <= 2.0
-    speeds, inputs = result.states[:, 1], result.inputs[:, 0]
-    expected = speeds[:-1] + 0.1 * (inputs - DRAG * speeds[:-1])
-    np.testing.assert_allclose(speeds[1:], expected, atol=1e-6)
-
-
 def test_where_a_black_box_can_be_driven_is_not_known() -> None:
     mapping = specification().to_mapping()
     with pytest.raises(IncompatibleError, match=r"policy\.states is 'reachable', .* to grid"):
@@ -142,19 +131,6 @@ def test_the_kernel_steps_a_black_box_as_the_reference_does(policy: str) -> None
         np.testing.assert_allclose(together.inputs, alone.inputs, atol=1e-9)
         np.testing.assert_allclose(together.loss, alone.loss, rtol=1e-6)
         np.testing.assert_allclose(together.reachable_loss, alone.reachable_loss, rtol=1e-6)
-
-
-def test_a_plan_and_an_update_in_numpy_explore_a_black_box() -> None:
-    own = {
-        "policy": {"_target_": "tests.dopt.custom_plugins.Coin"},
-        "learner": {"_target_": "tests.dopt.custom_plugins.Descent"},
-    }
-    spec = TrialSpec.from_mapping({**specification(horizon=20).to_mapping(), **own})
-    assert spec.config.path == "kernel"
-    fast, plain = run_trial(spec), run_trial(spec, "reference")
-    assert np.array_equal(fast.inputs, plain.inputs)
-    assert np.array_equal(fast.states, plain.states)
-    np.testing.assert_allclose(fast.parameters, plain.parameters, rtol=1e-9)
 
 
 def test_a_black_box_whose_known_part_does_not_compile_runs_on_the_reference() -> None:

@@ -24,8 +24,7 @@ from dopt.systems import SYSTEMS
 from tests.dopt.kernel.twin import model_of_kernel
 from tests.dopt.oracles.traces import jacobian, observed, trace
 from tests.dopt.test_limits import ABSOLUTE, CART, DEGREE, JOINTS, sensed
-from tests.dopt.trials import trial
-from tests.dopt.uniform import uniform_samples
+from tests.dopt.trials import trial, uniform_samples
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
     "gaussian_process": "conditioning"

@@ -13,7 +13,7 @@ from dopt import Explorer
 from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
 from dopt.assessment import loss_by_parameter_error, parameter_error, true_parameters
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.evaluation import evaluation_set
+from dopt.evaluation import evaluation_set, random_transitions
 from dopt.kernel import joint_kalman
 from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
@@ -41,8 +41,7 @@ from tests.dopt.oracles.test_oracles import filtered
 from tests.dopt.oracles.traces import jacobian as complex_jacobian
 from tests.dopt.oracles.traces import model_step
 from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, sensed
-from tests.dopt.trials import trial
-from tests.dopt.uniform import uniform_samples
+from tests.dopt.trials import trial, uniform_samples
 
 SMALL = {"width": 4, "depth": 2}
 
@@ -169,15 +168,10 @@ def test_fixed_parameters_of_a_linear_model_stay() -> None:
 
 def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:
     pytest.importorskip("gymnasium")
-    spec = TrialSpec.from_mapping(
-        {
-            "env": {"_target_": "tests.dopt.custom_environments.Point", "horizon": 40},
-            "policy": {"name": "random"},
-            "model": {"name": "mlp"},
-            "learner": {"name": "adam_window"},
-        }
-    )
-    samples = uniform_samples(spec)
+    env = {"_target_": "tests.dopt.custom_environments.Point", "horizon": 40}
+    spec = TrialSpec.from_names(env, "random")
+    system: Any = spec.system
+    samples = Samples(*random_transitions(system, 40, np.random.default_rng(0)))
     assert len(samples.states) == 40
     fitted = fit_offline(spec, samples.states, samples.accelerations)
     assert fitted.loss < grid_loss(spec, initial_weights(spec))
@@ -287,12 +281,12 @@ def innovations(
     return Innovations(kept, np.array(errors), np.array(variances))
 
 
-def after_fit(steps: int = 20, **learner: Any) -> KernelTrial:
+def after_fit(horizon: int = 20, **learner: Any) -> KernelTrial:
     """Return a trial of a small network that ends with a fit of all that was measured."""
-    spec = sensed("pendulum", ANGLE, horizon=steps, refit_every=steps, **learner)
+    spec = sensed("pendulum", ANGLE, horizon=horizon, refit_every=horizon, **learner)
     small = {"model": {"name": "mlp", "width": 4}}
     fast = KernelTrial(TrialSpec.from_mapping(spec.to_mapping() | small))
-    fast.advance(steps)
+    fast.advance(horizon)
     return fast
 
 
@@ -374,10 +368,10 @@ def test_the_log_loss_of_a_linear_model_is_lowest_with_the_covariance_of_the_noi
 
 
 def test_jacobians_are_those_of_complex_steps() -> None:
-    spec = trial("cartpole", "random")
-    theta, states = initial_weights(spec), evaluation_set(spec.system).states
-    expected = complex_jacobian(spec, theta, states)
-    assert jacobian(spec, theta, evaluated(spec)) == pytest.approx(expected, rel=1e-6, abs=1e-8)
+    spec = trial("cartpole", "random", model={"width": 4})
+    theta, at = initial_weights(spec), evaluated(spec)
+    expected = complex_jacobian(spec, theta, at.states)
+    assert jacobian(spec, theta, at) == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
 def test_r_squared_is_one_for_the_truth_and_falls_with_the_error() -> None:

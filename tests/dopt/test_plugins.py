@@ -17,12 +17,10 @@ from dopt.errors import SpecificationError
 from dopt.learning import Adam
 from dopt.learning.base import CompiledLearner
 from dopt.policies import DOptimal
-from dopt.policies.base import CompiledPolicy, CustomPolicy, Planner
+from dopt.policies.base import CompiledPolicy
 from dopt.reference.batch import run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems import System
-from dopt.trial_view import TrialView
 from tests.dopt.custom_plugins import ANSWERS
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
@@ -170,26 +168,6 @@ class Large(CompiledPolicy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn(CompiledPolicy, CustomPolicy):
-    """A random direction at each step."""
-
-    name: ClassVar[str] = "drawn"
-    compiled: ClassVar[bool] = True
-
-    @staticmethod
-    def plan(trial: Any, t: int, u: np.ndarray) -> None:
-        u[:] = trial.plant.gamma * trial.randomness.ties[t]
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return Directions()
-
-
-class Directions(Planner):
-    def choose(self, view: TrialView) -> np.ndarray:
-        return view.system.gamma * view.tie
-
-
-@dataclass(frozen=True, kw_only=True)
 class Broken(CompiledLearner):
     name: ClassVar[str] = "broken"
 
@@ -297,13 +275,6 @@ def test_what_a_compiled_function_may_not_do_is_one_sentence(
     with pytest.raises(SpecificationError, match=sentence) as caught:
         run_trial(changed(section, own_compiled(name), **more))
     assert "\n" not in str(caught.value)
-
-
-def test_both_paths_have_the_same_random_directions() -> None:
-    spec = changed("policy", own_compiled("Drawn"), "arm")
-    fast, plain = run_trial(spec), run_trial(spec, "reference")
-    assert np.array_equal(fast.inputs, plain.inputs)
-    assert len(np.unique(fast.inputs, axis=0)) == 12
 
 
 def test_a_class_does_not_inherit_that_it_is_compiled() -> None:

@@ -199,30 +199,21 @@ LEAST_SQUARES = {"name": "recursive_least_squares"}
 
 
 @pytest.mark.parametrize(
-    ("env", "policy", "changes"),
+    ("policy", "changes"),
     [
-        ("quadrotor", "periodic", {}),
-        ("pendulum", "periodic", {"env": {"name": "pendulum", "friction": 50.0}}),
-        ("pendulum", "oracle", {"model": {"name": "mlp"}}),
-        ("pendulum", "oracle", {"learner": {"name": "adam"}}),
-        ("pendulum", "d_optimal", {"learner": LEAST_SQUARES}),
-        ("pendulum", "random", {"model": LINEAR, "learner": LEAST_SQUARES}),
-        ("pendulum", "uniform", {"model": LINEAR}),
+        ("periodic", {"env": {"name": "quadrotor"}}),
+        ("oracle", {"model": {"name": "mlp"}}),
+        ("oracle", {"learner": {"name": "adam"}}),
+        ("d_optimal", {"learner": LEAST_SQUARES}),
+        ("random", {"model": LINEAR, "learner": LEAST_SQUARES}),
+        ("uniform", {"model": LINEAR}),
     ],
 )
 def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
-    env: str, policy: str, changes: dict[str, Any]
+    policy: str, changes: dict[str, Any]
 ) -> None:
-    possible = "arm" if policy == "periodic" else env
-    mapping: dict[str, Any] = trial(possible, policy).to_mapping()
-    mapping |= {"env": {"name": env}} | changes
-    with pytest.raises(IncompatibleError) as caught:
-        TrialSpec.from_mapping(mapping)
-    assert isinstance(caught.value, SpecificationError)
-    ends = (": change one of them.", ": choose another policy.")
-    if env == "pendulum" and policy == "periodic":
-        ends = (": set policy.frequency, or choose another policy.",)
-    assert str(caught.value).endswith(ends)
+    with pytest.raises(IncompatibleError, match=r": (change one of them|choose another policy)\.$"):
+        TrialSpec.from_mapping(trial("arm", policy).to_mapping() | changes)
 
 
 Config = Mapping[str, object]

@@ -60,11 +60,6 @@ class Mechanics(ABC):
         q, rates = self.split(state)
         return self.kinetic(q, rates) + self.potential(q)
 
-    def power(self, state: Tensor, u: Tensor) -> Tensor:
-        """Return the power of the input less the power of friction [W]."""
-        q, rates = self.split(state)
-        return (self.driving(q, rates, u) + self.friction(rates)) @ rates
-
     def accelerations(self, state: Tensor, u: Tensor) -> Tensor:
         """Return d²q/dt² by d/dt ∂L/∂q̇ - ∂L/∂q = forces."""
         q, rates = self.split(state)
@@ -100,10 +95,6 @@ class CarMechanics(Mechanics):
         ahead, left = state[3], state[4]
         world = [ahead * cosine - left * sine, ahead * sine + left * cosine, state[5]]
         return state[:3], torch.stack(world)
-
-    def power(self, state: Tensor, u: Tensor) -> Tensor:
-        self.angle = state[6]
-        return super().power(state, u)
 
     def accelerations(self, state: Tensor, u: Tensor) -> Tensor:
         self.angle = state[6]

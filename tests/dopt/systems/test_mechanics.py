@@ -53,19 +53,6 @@ def test_every_registered_system_with_inertia_is_held_against_masses() -> None:
 @mechanical
 @settings(max_examples=5)
 @given(data=st.data())
-def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.DataObject) -> None:
-    system = data.draw(systems(name))
-    x, u = data.draw(states(name)), data.draw(inputs(name))
-    flow, mechanics = system.derivative(x, u), mechanics_of(system)
-    slope = torch.func.grad(mechanics.energy)(torch.tensor(x)).numpy()
-    power = float(mechanics.power(torch.tensor(x), torch.tensor(u)))
-    size = np.abs(slope) @ np.abs(flow)
-    assert slope @ flow == pytest.approx(power, abs=1e-12 * (1.0 + size))
-
-
-@mechanical
-@settings(max_examples=5)
-@given(data=st.data())
 def test_equations_are_those_of_euler_and_lagrange(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
     x, u = data.draw(states(name)), data.draw(inputs(name))
