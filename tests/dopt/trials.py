@@ -15,29 +15,12 @@ from dopt.randomness import process_noise, stream
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 
-SMALL_GRIDS = {
-    "pendulum": (4, 4),
-    "cartpole": (3, 4, 3),
-    "arm": (2, 2, 2, 2),
-    "quadrotor": (4, 4),
-    "drifting_pendulum": (4, 4),
-    "chain": (16,),
-    "pendulum_unknown_gain": (4, 4),
-    "cartpole_unknown_gain": (3, 4, 3),
-    "unbalanced_disk": (4, 4),
-    "coupled_pendulums": (16,),
-    "moving_star": (4, 4),
-    "van_der_pol": (4, 4),
-    "car": (2, 2, 2, 2),
-    "drone": (16,),
-    "mass_spring": (2, 2, 2, 2),
-}
+AXES = {name: len(system().grid_points) for name, system in SYSTEMS.items()}
+SMALL_GRIDS = {name: {1: (16,), 2: (4, 4)}.get(axes, (2,) * axes) for name, axes in AXES.items()}
+SMALL_GRIDS |= dict.fromkeys(("cartpole", "cartpole_unknown_gain"), (3, 4, 3))
 SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}
 SMALL_SEARCHES |= {"episodic": SMALL_SEARCHES["icem"] | {"replan_every": 5}}
-SMALL_GRIDS = {
-    name: (2,) * len(system().grid_points) for name, system in SYSTEMS.items()
-} | SMALL_GRIDS
 SIZES = {"chain": {"n_links": 3}, "coupled_pendulums": {"n_pendulums": 3}}
 """Systems of any size: as small as an end, a middle and a start can be."""
 MODELS = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
