@@ -231,14 +231,6 @@ def test_the_reachable_set_has_states_that_the_square_wave_visits(name: str) -> 
     assert 0.05 * len(reached) < shared < 0.25 * len(reached)
 
 
-def test_a_pendulum_is_never_faster_than_its_terminal_speed() -> None:
-    pendulum = Pendulum(gamma=4.0)
-    weight = pendulum.mass * pendulum.gravity * pendulum.length / 2
-    terminal = (pendulum.gamma + weight) / pendulum.friction
-    speeds = np.abs(reachable_states(pendulum)[:, 1])
-    assert 1.0 < speeds.max() <= terminal
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_simulated_step_is_the_euler_map(name: str) -> None:
     system = dataclasses.replace(SYSTEMS[name](), horizon=5)

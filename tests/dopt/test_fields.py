@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Optional, Union
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dopt.control.task import Control
 from dopt.errors import SpecificationError
@@ -177,18 +175,6 @@ def test_an_unknown_name_is_answered_with_the_nearest(
 ) -> None:
     with pytest.raises(SpecificationError, match=sentence):
         build(section, REGISTRIES[section], given_section)
-
-
-@given(st.floats(allow_nan=True, allow_infinity=True))
-def test_exactly_the_positive_finite_numbers_are_lengths(value: float) -> None:
-    accepted = 0.0 < value < float("inf")
-    try:
-        length = SYSTEMS["pendulum"](length=value).length
-    except SpecificationError:
-        assert not accepted
-    else:
-        assert accepted
-        assert length == value
 
 
 @dataclass(frozen=True, kw_only=True)
