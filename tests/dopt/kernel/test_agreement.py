@@ -170,13 +170,13 @@ def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str,
         assert relative_gap(fast.parameters, plain.parameters) < 1e-8
 
 
-@pytest.mark.parametrize("form", ["primal", "dual", "sketch"])
+@pytest.mark.parametrize("form", FORMS)
 def test_every_form_of_the_information_matrix_agrees_for_a_deep_network(form: str) -> None:
     policy, model = {"form": form, "sketch_size": 48}, {"width": 9, "depth": 3}
     check_agreement(trial("arm", "d_optimal", 2, env={"horizon": 14}, policy=policy, model=model))
 
 
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+@pytest.mark.parametrize("env", PAPER)
 def test_d_optimal_inputs_of_the_oracle_model_at_another_ridge(env: str) -> None:
     policy = {"name": "d_optimal", "regularization": 0.1}
     mapping: dict[str, Any] = trial(env, "oracle", 5, env={"horizon": 12}).to_mapping()
@@ -314,9 +314,6 @@ def test_seeds_share_what_they_are_told_apart_by() -> None:
     assert np.array_equal(one.record.states[0], two.record.states[0])
 
 
-PATHS = pytest.mark.parametrize("path", ["kernel", "reference"])
-
-
 class Answering(Planner):
     """A plan whose inputs a function gives."""
 
@@ -372,59 +369,36 @@ class Teaching(CustomLearner):
         return update
 
 
-def own(name: str, what: str) -> dict[str, object]:
-    return {"_target_": f"{__name__}.{name}", "what": what}
+INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(\)"
 
 
-def refused(policy: Any, learner: Any, path: Path, sentence: str) -> None:
-    env = {"name": "pendulum", "horizon": 5, "grid_points": [4, 4]}
-    spec = TrialSpec.from_names(env, policy, learner=learner)
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+@pytest.mark.parametrize(
+    ("part", "what", "sentence"),
+    [
+        ("policy", "none", r"^planner\(\) of policy 'bringing' returned None, .*base\.Planner"),
+        ("policy", "text", r"an object of type str, .* return one that has choose, observe"),
+        ("policy", "class", r"returned the class Answering itself, .* return Answering\(\.\.\.\)"),
+        ("policy", "unwatching", r"of type Unwatching, .* return one that has observe, feedback"),
+        ("learner", "none", r"^updater\(\) of learner 'teaching' returned None, .*base\.Updater"),
+        ("learner", "text", r"returned an object of type str, .* return one that has update"),
+        ("learner", "silent", r"^learner 'teaching' returned None, but parameters .* update\(\)"),
+        ("policy", "no input", INPUT.format("None")),
+        ("policy", "word", INPUT.format("'left'")),
+        ("policy", "complex", INPUT.format(r"array\(\[0\.\+1\.j\]\)")),
+        ("policy", "ragged", INPUT.format(r"\[\[1\.0\], 2\.0\]")),
+        ("policy", "nan", INPUT.format(r"array\(\[nan\]\)")),
+    ],
+)
+def test_what_a_part_of_ones_own_returns_is_checked(
+    part: str, what: str, sentence: str, path: Path
+) -> None:
+    own: Any = {"policy": Bringing(what=what), "learner": Teaching(what=what)}[part]
+    system = SYSTEMS["pendulum"](horizon=5, grid_points=(4, 4))
+    spec = TrialSpec.of_system(system, **({"policy": "random"} | {part: own}))
     with pytest.raises(SpecificationError, match=sentence) as caught:
         run_trial(spec, path)
     assert "\n" not in str(caught.value)
-
-
-@PATHS
-@pytest.mark.parametrize(
-    ("what", "sentence"),
-    [
-        ("none", r"^planner\(\) of policy 'bringing' returned None, .*base\.Planner .* add the r"),
-        ("text", r"returned an object of type str, .* return one that has choose, observe"),
-        ("class", r"returned the class Answering itself, .* return Answering\(\.\.\.\)"),
-        ("unwatching", r"returned an object of type Unwatching, .* one that has observe, feedback"),
-    ],
-)
-def test_what_is_no_planner_is_refused(what: str, sentence: str, path: Path) -> None:
-    refused(own("Bringing", what), "adam", path, sentence)
-
-
-@PATHS
-@pytest.mark.parametrize(
-    ("what", "sentence"),
-    [
-        ("none", r"^updater\(\) of learner 'teaching' returned None, .*base\.Updater .* add the r"),
-        ("text", r"returned an object of type str, .* return one that has update"),
-        ("silent", r"^learner 'teaching' returned None, but parameters of shape .* its update\(\)"),
-    ],
-)
-def test_what_is_no_updater_is_refused(what: str, sentence: str, path: Path) -> None:
-    refused("random", own("Teaching", what), path, sentence)
-
-
-@PATHS
-@pytest.mark.parametrize(
-    ("what", "shown"),
-    [
-        ("no input", "None"),
-        ("word", "'left'"),
-        ("complex", r"array\(\[0\.\+1\.j\]\)"),
-        ("ragged", r"\[\[1\.0\], 2\.0\]"),
-        ("nan", r"array\(\[nan\]\)"),
-    ],
-)
-def test_an_input_that_is_no_finite_numbers_is_refused(what: str, shown: str, path: Path) -> None:
-    sentence = rf"of policy 'bringing' returned {shown} at step 1, .* \(1,\), .* its choose\(\)"
-    refused(own("Bringing", what), "adam", path, sentence)
 
 
 STEPS = 4_000

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import llvmlite.binding
 import numpy as np
 import pytest
 
@@ -24,14 +23,14 @@ from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import content_digest
 from dopt.kernel.equations import name_of_equations
-from dopt.kernel.from_spec import network_of
+from dopt.kernel.from_spec import KINDS, network_of
 from dopt.kernel.information import FORMS
 from dopt.kernel.pointers import function_of
-from dopt.kernel.run import KernelTrial, trial_in_kernel
+from dopt.kernel.run import trial_in_kernel
 from dopt.kernel.warming import choices, kernel_parts, needed_parts
 from dopt.learning import LEARNERS
 from dopt.learning.base import Learner
-from dopt.models import Model
+from dopt.models import RFF
 from dopt.policies import POLICIES, Search
 from dopt.policies.base import ClosedLoop
 from dopt.policies.search import SCORES, score_code
@@ -41,6 +40,14 @@ from dopt.systems import SYSTEMS
 from tests.dopt.trials import trial
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
+
+
+def cache_without(folder: Path, *names: str) -> dict[str, str]:
+    """Return the environment of processes whose cache is the warm one without some files."""
+    warm_up()
+    copy, without = folder / "dopt" / cache.CACHE_FOLDER.name, shutil.ignore_patterns(*names)
+    shutil.copytree(cache.CACHE_FOLDER, copy, copy_function=os.symlink, ignore=without)
+    return os.environ | {"DOPT_CACHE": str(folder)}
 
 
 @pytest.fixture
@@ -80,17 +87,14 @@ def test_compiling_is_said_at_once(folder: Path, caplog: pytest.LogCaptureFixtur
     assert len(caplog.records) == 1
 
 
-def test_what_is_in_the_cache_is_read_by_all_at_once(folder: Path) -> None:
+def test_what_is_in_the_cache_is_read_by_all_at_once_and_what_failed_is_not(folder: Path) -> None:
+    with pytest.raises(KeyError), one_compiler_at_a_time("loop"):
+        raise KeyError
+    assert not (folder / "loop.complete").exists()
     with one_compiler_at_a_time("loop"):
         pass
     with one_compiler_at_a_time("other"), one_compiler_at_a_time("loop"):
         assert (folder / "loop.complete").exists()
-
-
-def test_a_failed_compilation_is_not_taken_for_a_complete_one(folder: Path) -> None:
-    with pytest.raises(KeyError), one_compiler_at_a_time("loop"):
-        raise KeyError
-    assert not (folder / "loop.complete").exists()
 
 
 def test_a_warm_cache_is_seen_without_the_compiler_and_a_trial_runs_without_its_rules() -> None:
@@ -133,33 +137,13 @@ def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", program],
-        env=os.environ | {"DOPT_CACHE": str(tmp_path)},
+        env=cache_without(tmp_path, "*add_nothing*"),
         capture_output=True,
         text=True,
         check=True,
     )
     assert done.stdout.split() == ["1", "0"]
     assert "0 of 1 parts" in done.stderr
-
-
-def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(pointers, "compile_missing", asked.extend)
-    monkeypatch.setattr(pointers, "_trials", {})
-    KernelTrial(TrialSpec.from_names("pendulum", "d_optimal")).advance(1)
-    assert set(asked) == {
-        "dopt.kernel.loop.advance",
-        "dopt.kernel.held.hold",
-        "dopt.kernel.loop.keep_input",
-        "dopt.kernel.loop.note_nothing",
-        "dopt.kernel.loop.keep_state",
-        "dopt.kernel.integration.observe_euler",
-        "dopt.kernel.policies.plan_d_optimal",
-        "dopt.kernel.learners.learn_newest",
-        "dopt.kernel.information.add_network_rows",
-        "dopt.kernel.information.network_forms",
-    }
-    assert set(asked) <= {*kernel_parts(everything=True)}
 
 
 GRID = {
@@ -185,6 +169,7 @@ def test_a_grid_compiles_what_its_trials_ask_for_and_no_more(
         trial_in_kernel(spec).advance(1)
     systems = {name_of_equations(spec.system) for spec in specs}
     assert {*needed_parts(spec.config for spec in specs)} == {*asked} | systems
+    assert {*asked} <= {*kernel_parts(everything=True)}
 
 
 def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: Path) -> None:
@@ -196,7 +181,7 @@ def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: 
         "with compiling([TrialSpec.from_names(system, 'random').config]):\n"
         "    print('numba' in sys.modules)\n"
     )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
+    environment = cache_without(tmp_path, "kinds-*")
     answers = [
         subprocess.run(
             [sys.executable, "-c", program, horizon],
@@ -210,24 +195,11 @@ def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: 
     assert answers == ["True\n", "False\n"]
 
 
-def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the processor has the same name and offers less, as in a virtual machine."""
-
-    class Less(dict[str, bool]):
-        def flatten(self) -> str:
-            return "-avx2"
-
-    here = cache._source_digest()
-    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", Less)
-    assert cache._source_digest() != here
-
-
 def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
     """The same sources in another folder: nothing is compiled, and the numbers are the same."""
     program = (
         "import numpy as np\n"
         "from dopt.kernel.equations import compiled_equations\n"
-        "from dopt.kernel.network import tanh\n"
         "from dopt.systems import SYSTEMS\n"
         "function = compiled_equations(SYSTEMS['pendulum']()).accelerations\n"
         "out = np.empty(1)\n"
@@ -235,21 +207,19 @@ def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
         "print(sum(function.stats.cache_misses.values()), out[0].hex())\n"
     )
     shutil.copytree(ROOT / "dopt", tmp_path / "elsewhere/dopt")
-    answers = []
-    for checkout in (ROOT, tmp_path / "elsewhere"):
-        done = subprocess.run(
+    (missed, number), (again, same) = (
+        subprocess.run(
             [sys.executable, "-c", program],
             env=os.environ | {"DOPT_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(checkout)},
             cwd=checkout,
-            capture_output=True,
+            stdout=subprocess.PIPE,
             text=True,
             check=True,
-        )
-        answers.append((done.stdout.split(), "compiling" in done.stderr))
-    (first, compiling), (second, again) = answers
-    assert (first[0], compiling) == ("1", True)
-    assert (second[0], again) == ("0", False)
-    assert first[1] == second[1]
+        ).stdout.split()
+        for checkout in (ROOT, tmp_path / "elsewhere")
+    )
+    assert (missed, again) == ("1", "0")
+    assert number == same
 
 
 def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_path: Path) -> None:
@@ -332,14 +302,11 @@ def test_a_constant_from_elsewhere_is_part_of_the_content(tmp_path: Path, value:
     assert other not in (None, usual)
 
 
-def test_what_cannot_be_told_is_not_kept(tmp_path: Path) -> None:
+def test_what_cannot_be_told_or_has_no_file_is_not_kept(tmp_path: Path) -> None:
     from tests.dopt import trials
 
     for value in ([1.0], {"a": 1}, trials, trials.trial, object()):
         assert content_digest(function_with(tmp_path, FACTOR=value)) is None
-
-
-def test_a_function_without_a_file_is_not_kept() -> None:
     names: dict[str, types.FunctionType] = {}
     exec("def plan(x, out):\n    out[0] = x\n", names)
     assert content_digest(names["plan"]) is None
@@ -359,21 +326,6 @@ class NewLearner(Learner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NewModel(Model):
-    name: ClassVar[str] = "new"
-    compiled: ClassVar[bool] = True
-
-    def n_parameters(self, system: object) -> int:  # noqa: ARG002
-        return 1
-
-    def initial_parameters(self, system: object, rng: object) -> np.ndarray:  # noqa: ARG002
-        return np.zeros(1)
-
-    def predict_at(self, system: object, parameters: object, points: np.ndarray) -> np.ndarray:  # noqa: ARG002
-        return points
-
-
-@dataclass(frozen=True, kw_only=True)
 class NewSearch(Search):
     name: ClassVar[str] = "new"
 
@@ -388,9 +340,10 @@ def test_a_kernel_function_that_does_not_exist_is_named(part: ClosedLoop | Learn
         function_of(part, None)
 
 
-def test_a_model_that_the_kernel_does_not_know_is_refused() -> None:
-    with pytest.raises(SpecificationError, match="model 'new' says that it is compiled"):
-        network_of(SYSTEMS["pendulum"](), NewModel())
+def test_a_model_that_the_kernel_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(KINDS, RFF)
+    with pytest.raises(SpecificationError, match="model 'rff' says that it is compiled"):
+        network_of(SYSTEMS["pendulum"](), RFF())
 
 
 def test_an_unknown_score_is_refused() -> None:
