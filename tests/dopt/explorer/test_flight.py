@@ -15,6 +15,7 @@ from dopt.systems import Pendulum, Real
 from dopt.systems.real import Flight
 from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
+from tests.waiting import PATIENCE_SECONDS
 
 DT = MOTOR.dt
 
@@ -51,22 +52,24 @@ def error(explorer: Explorer) -> float:
 
 
 @pytest.mark.parametrize(
-    "rig",
-    [{"delay": DT}, {"delay": 1.7 * DT}, {"delay": 2 * DT, "lag": 0.03, "supply": 5.0}],
-    ids=str,
+    "rig", [{"delay": 1.7 * DT}, {"delay": 2 * DT, "lag": 0.03, "supply": 5.0}], ids=str
 )
 def test_what_is_declared_is_recovered_as_without_it(rig: dict[str, float]) -> None:
-    explorer = explored(declared(**rig), known := Rig(**rig))
+    explorer = explored(declared(**rig), known := Rig(**rig), 150)
     np.testing.assert_allclose(explorer.inputs, known.acted, atol=1e-12)
     assert np.abs(explorer.inputs).max() <= rig.get("supply", 6.0) + 1e-12
     assert error(explorer) < 0.5
-    assert error(explored(MOTOR, Rig(**rig))) > 5.0
+    assert error(explored(MOTOR, Rig(**rig), 150)) > 5.0
 
 
-def test_the_first_guess_of_an_unknown_delay_is_taken() -> None:
-    one = explored(declared(delay=unknown(DT, spread=0.01)), Rig(DT), 50)
-    other = explored(declared(delay=DT), Rig(DT), 50)
-    np.testing.assert_array_equal(one.parameters, other.parameters)
+def test_the_first_guess_of_an_unknown_delay_is_taken_also_by_a_policy_that_searches() -> None:
+    given: dict[str, Any] = {"policy": "exact", "deadline": PATIENCE_SECONDS}
+    with (
+        explored(declared(delay=unknown(DT, spread=0.01)), Rig(DT), 30, **given) as one,
+        explored(declared(delay=DT), Rig(DT), 30, policy="exact") as other,
+    ):
+        np.testing.assert_array_equal(one.parameters, other.parameters)
+        assert (one.counts["missed"], one.counts["learned"]) == (0, 30)
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
@@ -101,25 +104,20 @@ def test_the_plan_is_that_of_a_simulated_system_behind_the_same_delay(policy: st
     np.testing.assert_allclose(own.errors, real.errors, rtol=1e-6)
 
 
-def asked(explorer: Explorer, u: float, x: Array, time: float | None = None) -> bool:
-    """Tell a state that followed an input, and return whether it was learned from."""
-    return explorer.tell(x, applied=[u], time=time)
-
-
 def test_in_a_gap_the_last_input_is_held() -> None:
     explorer = Explorer(declared(delay=2 * DT), policy="random", steps=20)
     explorer.ask([0.0, 0.0], time=0.0)
     for k in range(1, 5):
-        assert asked(explorer, float(k), np.array([0.01 * k, 0.1]), k * DT)
-        explorer.ask(np.array([0.01 * k, 0.1]), time=k * DT)
+        assert explorer.tell([0.01 * k, 0.1], applied=[k], time=k * DT)
+        explorer.ask([0.01 * k, 0.1], time=k * DT)
     np.testing.assert_allclose(explorer.inputs[:, 0], [0.0, 0.0, 1.0, 2.0])
-    answer = explorer.ask(np.array([0.04, 0.1]))[0]
-    assert not explorer.tell(np.array([0.06, 0.1]), time=5 * DT + 0.015)  # a gap of 1.75 dt
-    assert asked(explorer, 9.0, np.array([0.07, 0.1]), 6 * DT + 0.015)
+    answer = explorer.ask([0.04, 0.1])[0]
+    assert not explorer.tell([0.06, 0.1], time=5 * DT + 0.015)  # a gap of 1.75 dt
+    assert explorer.tell([0.07, 0.1], applied=[9.0], time=6 * DT + 0.015)
     assert explorer.inputs[-1, 0] == pytest.approx(answer)  # held for two steps
     explorer.reset()
     explorer.ask([0.0, 0.0], time=0.0)
-    assert asked(explorer, 1.0, np.array([0.0, 0.1]), DT)
+    assert explorer.tell([0.0, 0.1], applied=[1.0], time=DT)
     assert explorer.inputs[-1, 0] == 0.0
 
 
@@ -134,14 +132,6 @@ def test_a_free_run_is_told_what_acted() -> None:
     late = explorer.free_run_error(np.array(x)[29:], np.array(sent)[29:], 10)
     without = explored(MOTOR, Rig()).free_run_error(np.array(x)[29:], np.array(sent)[29:], 10)
     assert late < 0.2 * without
-
-
-def test_a_policy_that_searches_sees_through_a_delay_with_a_deadline() -> None:
-    plant = declared(delay=DT, lag=0.01)
-    explorer = explored(plant, Rig(DT, 0.01), 60, policy="exact", deadline=60.0)
-    assert explorer.counts["missed"] == 0
-    assert explorer.counts["learned"] == 60
-    explorer.close()
 
 
 @pytest.mark.parametrize(

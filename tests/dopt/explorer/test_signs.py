@@ -59,12 +59,8 @@ def test_an_undeclared_delay_is_said_with_its_samples(
         assert one.counts["late"] == 2  # at steps 500 and 800
     [text] = [text for text in said(caplog) if "earlier steps" in text]
     assert f"{delay} samples before" in text
-
-
-def test_a_declared_delay_is_no_sign() -> None:
-    plant = dataclasses.replace(MOTOR, delay=2 * MOTOR.dt)
-    with Explorer(plant, policy="random", steps=STEPS) as one:
-        drive(one, STEPS, 2)
+    with Explorer(dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random") as one:
+        drive(one, STEPS, delay)
         assert one.counts["late"] == 0
 
 
