@@ -247,7 +247,7 @@ def test_arguments_that_are_none_are_refused(call: str, given: list[Any], said: 
         ({"fallback": [7.0]}, "at most 6"),
         ({"fallback": [1.0, 1.0]}, "1 real number is expected"),
         ({"policy": None}, "'policy' is None"),
-        ({"policy": "oracle"}, "goes with"),
+        ({"policy": "oracle"}, "needs dynamics that are linear"),
         ({"learner": None}, "'learner' is None"),
         ({"model": 5}, "'model' is 5"),
         ({"journal": 5}, "journal is 5, but the path of a file"),

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import signal
+import shutil
 import sqlite3
-import subprocess
 import sys
 import threading
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -40,7 +38,6 @@ from orchestrate.store.merge import merge
 from tests.dopt.explorer.plants import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN, begin
 from tests.orchestrate.store.test_leases import wait_for_renewals
-from tests.paths import ROOT
 
 
 def test_what_ask_and_tell_took_is_stored(url: str, run: Explorer) -> None:
@@ -356,28 +353,21 @@ def test_fewer_steps_of_the_same_run_are_left_out(sqlite_url: str, run: Explorer
     assert run.save(sqlite_url) is False, "the other one has gone further"
 
 
-def test_after_a_kill_the_journal_goes_on_with_the_same_trial(
-    sqlite_url: str, tmp_path: Path
-) -> None:
-    program = f"""
-import os, signal
-from tests.dopt.explorer.plants import drive, explorer
-one = explorer(journal={str(tmp_path / "run.jsonl")!r})
-for _ in range(3):
-    drive(one, 20)
-    one.save({sqlite_url!r})
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False)
-    assert done.returncode == -signal.SIGKILL
-    before = content(sqlite_url)
-    with explorer(journal=tmp_path / "run.jsonl") as again:
-        assert again.n_steps == before["n_steps"] == 60
-        again.save(sqlite_url)
-        assert content(sqlite_url) == before
-        drive(again, 10)
-        again.save(sqlite_url)
-        after = content(sqlite_url)
+def test_after_a_kill_the_journal_goes_on_with_the_same_trial(url: str, tmp_path: Path) -> None:
+    """What a kill leaves is the journal and a session that nobody has ended."""
+    with explorer(journal=tmp_path / "run.jsonl") as killed:
+        for _ in range(3):
+            drive(killed, 20)
+            killed.save(url)
+        before = content(url)
+        shutil.copy(tmp_path / "run.jsonl", tmp_path / "left.jsonl")
+        with explorer(journal=tmp_path / "left.jsonl") as again:
+            assert again.n_steps == before["n_steps"] == 60
+            again.save(url)
+            assert content(url) == before
+            drive(again, 10)
+            again.save(url)
+        after = content(url)
     assert after["trial_key"] == before["trial_key"]
     assert after["steps"][:60] == before["steps"]
     assert after["n_steps"] == 70
@@ -402,26 +392,6 @@ def test_a_save_that_fails_in_the_middle_leaves_what_was_stored(
     assert run.save(url)
     assert content(url)["n_steps"] == 80
     assert not examine(url, trial_key)
-
-
-def test_a_locked_database_is_said_and_the_exploration_goes_on(
-    sqlite_url: str, monkeypatch: pytest.MonkeyPatch, run: Explorer
-) -> None:
-    opening = partial(Store.open, patience=0.05)
-    monkeypatch.setattr("orchestrate.runner.saving.Store.open", opening)
-    run.save(sqlite_url)
-    before = content(sqlite_url)
-    other = sqlite3.connect(sqlite_url.removeprefix("sqlite:///"), isolation_level=None)
-    other.execute("BEGIN IMMEDIATE")
-    drive(run, 10)
-    with pytest.raises(StoreUnavailableError, match=r"has locked it for more than 0.05 s"):
-        run.save(sqlite_url)
-    assert content(sqlite_url) == before
-    drive(run, 10)
-    other.execute("ROLLBACK")
-    other.close()
-    assert run.save(sqlite_url)
-    assert content(sqlite_url)["n_steps"] == 60
 
 
 def test_without_orchestrate_that_is_said(run: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:

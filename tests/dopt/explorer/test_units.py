@@ -196,39 +196,32 @@ def test_other_units_change_hardly_anything(case: str) -> None:
         assert found.free_run_error == pytest.approx(expected.free_run_error, rel=0.05), units
 
 
-class TestSizes:
-    """What a state is divided by where the box says nothing of it."""
+def sized(**changed: Any) -> Plant:
+    """Return a plant whose box says nothing of most states."""
+    given: dict[str, Any] = {
+        "states": {"place": "m", "speed": "m/s", "level": "V"},
+        "inputs": {"force": "N"},
+        "dt": 0.1,
+        "gamma": 2.0,
+        "known": {"place": "speed", "speed": "force / 4"},
+        "learned": ["level"],
+        "box": {"level": 5.0},
+    }
+    return Plant(**(given | changed))
 
-    def plant(self, **changed: Any) -> Plant:
-        given: dict[str, Any] = {
-            "states": {"place": "m", "speed": "m/s", "level": "V"},
-            "inputs": {"force": "N"},
-            "dt": 0.1,
-            "gamma": 2.0,
-            "known": {"place": "speed", "speed": "force / 4"},
-            "learned": ["level"],
-            "box": {"level": 5.0},
-        }
-        return Plant(**(given | changed))
 
-    def test_it_is_how_far_known_rates_lead(self) -> None:
-        seconds = STEPS_ACROSS * 0.1
-        place, speed, level = self.plant().scales
-        assert speed == pytest.approx(2.0 / 4.0 * seconds)
-        assert 0.9 * speed * seconds < place <= speed * seconds
-        assert level == pytest.approx(5.0 / seconds)
-
-    def test_it_is_what_leads_through_the_box(self) -> None:
-        known = {"place": "speed / 1000", "speed": "0", "level": "force"}
-        plant = self.plant(known=known, learned=["speed"], box={"place": 3.0})
-        seconds = STEPS_ACROSS * 0.1
-        assert plant.scales[1] * seconds == pytest.approx(1000.0 * 3.0 / seconds)
-
-    def test_the_limit_goes_by_it(self) -> None:
-        limits = self.plant().system(5, scaled=True).state_limits
-        assert limits[2] == 5000.0
-        assert (self.plant(limit=7.0).system(5, scaled=True).state_limits == 7.0).all()
-        assert (self.plant().system(5).state_limits == 1e4).all()
+def test_a_state_without_a_box_is_divided_by_how_far_rates_lead_and_its_limit_goes_by_it() -> None:
+    seconds = STEPS_ACROSS * 0.1
+    place, speed, level = sized().scales
+    assert speed == pytest.approx(2.0 / 4.0 * seconds)
+    assert 0.9 * speed * seconds < place <= speed * seconds
+    assert level == pytest.approx(5.0 / seconds)
+    known = {"place": "speed / 1000", "speed": "0", "level": "force"}
+    through = sized(known=known, learned=["speed"], box={"place": 3.0})  # what leads through it
+    assert through.scales[1] * seconds == pytest.approx(1000.0 * 3.0 / seconds)
+    assert sized().system(5, scaled=True).state_limits[2] == 5000.0
+    assert (sized(limit=7.0).system(5, scaled=True).state_limits == 7.0).all()
+    assert (sized().system(5).state_limits == 1e4).all()
 
 
 def test_a_rate_in_other_units_is_found_by_differences() -> None:

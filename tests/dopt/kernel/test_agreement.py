@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,21 +15,19 @@ import pytest
 
 from dopt.algorithm import Form
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.kernel.linear_algebra import dense, initial_covariance, rank_update, restore
+from dopt.kernel.linear_algebra import dense, initial_covariance, rank_update
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.structs import Covariance
 from dopt.learning import LEARNERS
 from dopt.learning.base import CustomLearner, Learner, Updater
 from dopt.models import MODELS
 from dopt.models.base import Model
 from dopt.policies import POLICIES
-from dopt.policies.base import Array, CustomPolicy, OpenLoop, Planner, Policy
+from dopt.policies.base import CustomPolicy, OpenLoop, Planner, Policy
 from dopt.result import TrialResult
 from dopt.run import Path, run_trial
 from dopt.spec.compatibility import REFERENCE_POLICIES, held_information
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, System
-from dopt.trial_view import TrialView
 from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.kernel.twin import interpreted, relative_gap, run
 from tests.dopt.newcomers import Alternating, Average
@@ -176,13 +175,6 @@ def test_every_form_of_the_information_matrix_agrees_for_a_deep_network(form: st
     check_agreement(trial("arm", "d_optimal", 2, env={"horizon": 14}, policy=policy, model=model))
 
 
-@pytest.mark.parametrize("env", PAPER)
-def test_d_optimal_inputs_of_the_oracle_model_at_another_ridge(env: str) -> None:
-    policy = {"name": "d_optimal", "regularization": 0.1}
-    mapping: dict[str, Any] = trial(env, "oracle", 5, env={"horizon": 12}).to_mapping()
-    check_agreement(TrialSpec.from_mapping(mapping | {"policy": policy}))
-
-
 def test_times_are_measured_and_add_up_to_less_than_the_whole() -> None:
     result = run_trial(trial("arm", "d_optimal"))
     for column in (result.plan_us, result.learn_us, result.evaluate_us):
@@ -314,38 +306,22 @@ def test_seeds_share_what_they_are_told_apart_by() -> None:
     assert np.array_equal(one.record.states[0], two.record.states[0])
 
 
-class Answering(Planner):
-    """A plan whose inputs a function gives."""
-
-    def __init__(self, answer: Callable[[TrialView], Any]) -> None:
-        self._answer = answer
-
-    def choose(self, view: TrialView) -> Array:
-        answer: Array = self._answer(view)
-        return answer
-
-
-class Unwatching:
-    def choose(self, view: TrialView) -> Array:
-        return view.inputs[-1]
-
-
-class Silent(Updater):
-    def update(self, view: TrialView) -> Array:  # noqa: ARG002
-        return None  # type: ignore[return-value]  # the mistake
+def answering(answer: object) -> SimpleNamespace:
+    """Return a plan whose inputs are given."""
+    return SimpleNamespace(choose=lambda _: answer, observe=print, feedback=print)
 
 
 GIVEN: dict[str, Any] = {
     "none": None,
     "text": "x",
-    "class": Answering,
-    "unwatching": Unwatching(),
-    "silent": Silent(),
-    "no input": Answering(lambda _: None),
-    "word": Answering(lambda _: "left"),
-    "complex": Answering(lambda _: np.array([1j])),
-    "ragged": Answering(lambda _: [[1.0], 2.0]),
-    "nan": Answering(lambda _: np.array([np.nan])),
+    "class": Planner,
+    "unwatching": SimpleNamespace(choose=print),
+    "silent": SimpleNamespace(update=lambda _: None),
+    "no input": answering(None),
+    "word": answering("left"),
+    "complex": answering(np.array([1j])),
+    "ragged": answering([[1.0], 2.0]),
+    "nan": answering(np.array([np.nan])),
 }
 
 
@@ -378,8 +354,12 @@ INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(
     [
         ("policy", "none", r"^planner\(\) of policy 'bringing' returned None, .*base\.Planner"),
         ("policy", "text", r"an object of type str, .* return one that has choose, observe"),
-        ("policy", "class", r"returned the class Answering itself, .* return Answering\(\.\.\.\)"),
-        ("policy", "unwatching", r"of type Unwatching, .* return one that has observe, feedback"),
+        ("policy", "class", r"returned the class Planner itself, .* return Planner\(\.\.\.\)"),
+        (
+            "policy",
+            "unwatching",
+            r"of type SimpleNamespace, .* return one that has observe, feedback",
+        ),
         ("learner", "none", r"^updater\(\) of learner 'teaching' returned None, .*base\.Updater"),
         ("learner", "text", r"returned an object of type str, .* return one that has update"),
         ("learner", "silent", r"^learner 'teaching' returned None, but parameters .* update\(\)"),
@@ -401,7 +381,7 @@ def test_what_a_part_of_ones_own_returns_is_checked(
     assert "\n" not in str(caught.value)
 
 
-STEPS = 4_000
+STEPS = 2_000
 REGULARIZATION = 1e-7
 
 
@@ -416,9 +396,9 @@ def test_many_steps_at_a_tiny_regularization_drift_little() -> None:
     fast = KernelTrial(spec)
     q = len(fast.state.theta)
     M = REGULARIZATION * np.eye(q)
-    for start in range(0, STEPS, 1_000):
-        parameters = run(fast, 1_000)
-        J = jacobians(spec, parameters, fast.record.states[start : start + 1_000])
+    for start in range(0, STEPS, 500):
+        parameters = run(fast, 500)
+        J = jacobians(spec, parameters, fast.record.states[start : start + 500])
         rows = J.reshape(-1, q)
         M += rows.T @ rows
         carried = dense(fast.state.covariance)
@@ -430,30 +410,12 @@ def test_many_steps_at_a_tiny_regularization_drift_little() -> None:
         assert gain == pytest.approx(fresh, rel=1e-6)
 
 
-def covariance(matrix: np.ndarray) -> Covariance:
-    q = len(matrix)
-    made = initial_covariance(q, 1.0, n_rows=1, n_planned=1)
-    made.upper[:q, :q] = matrix
-    return made
-
-
 def test_a_negative_variance_is_mended() -> None:
     rng = np.random.default_rng(0)
     axes, _ = np.linalg.qr(rng.standard_normal((6, 6)))
     broken = axes @ np.diag([2.0, 1.0, 0.5, 0.1, 1e-3, -1e-6]) @ axes.T
-    carried = covariance(broken)
+    carried = initial_covariance(6, 1.0, n_rows=1, n_planned=1)
+    carried.upper[:6, :6] = broken
     interpreted(rank_update)(carried, axes[:, 5:].T.copy(), np.zeros(1))
     assert np.linalg.eigvalsh(dense(carried))[0] >= -1e-15
     assert np.linalg.norm(dense(carried) - broken, 2) < 2e-6
-
-
-def test_restoring_keeps_what_is_definite() -> None:
-    rng = np.random.default_rng(1)
-    A = rng.standard_normal((7, 7))
-    carried = covariance(A @ A.T)
-    carried.pending[0, :7] = 1e-2 * rng.standard_normal(7)
-    carried.n_pending[0] = 1
-    before = dense(carried)
-    interpreted(restore)(carried)
-    assert carried.n_pending[0] == 0
-    assert dense(carried) == pytest.approx(before, rel=1e-12, abs=1e-12)

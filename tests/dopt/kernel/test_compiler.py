@@ -75,18 +75,6 @@ def test_a_second_compiler_of_a_function_waits_for_the_first(folder: Path) -> No
     assert after_first == [True]
 
 
-def test_compiling_is_said_at_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:  # noqa: ARG001
-    caplog.set_level("INFO")
-    with one_compiler_at_a_time("loop-1"):
-        [record] = caplog.records
-    assert record.name == "dopt.kernel"
-    assert "compiling the kernel, once per machine" in record.message
-    assert "loop" in record.message
-    with one_compiler_at_a_time("loop-1"):
-        pass
-    assert len(caplog.records) == 1
-
-
 def test_what_is_in_the_cache_is_read_by_all_at_once_and_what_failed_is_not(folder: Path) -> None:
     with pytest.raises(KeyError), one_compiler_at_a_time("loop"):
         raise KeyError
@@ -325,15 +313,6 @@ class NewLearner(Learner):
     kernel_function: ClassVar[str] = "dopt.kernel.learners.forgotten"
 
 
-@dataclass(frozen=True, kw_only=True)
-class NewSearch(Search):
-    name: ClassVar[str] = "new"
-
-    @property
-    def score(self) -> str:
-        return "juint"
-
-
 @pytest.mark.parametrize("part", [NewPolicy(), NewLearner()])
 def test_a_kernel_function_that_does_not_exist_is_named(part: ClosedLoop | Learner) -> None:
     with pytest.raises(SpecificationError, match="'new' names the kernel function"):
@@ -344,11 +323,6 @@ def test_a_model_that_the_kernel_does_not_know_is_refused(monkeypatch: pytest.Mo
     monkeypatch.delitem(KINDS, RFF)
     with pytest.raises(SpecificationError, match="model 'rff' says that it is compiled"):
         network_of(SYSTEMS["pendulum"](), RFF())
-
-
-def test_an_unknown_score_is_refused() -> None:
-    with pytest.raises(SpecificationError, match=r"score of policy 'new'.*joint"):
-        score_code(NewSearch())
 
 
 def test_every_score_has_a_name_and_each_policy_that_searches_one_of_them() -> None:

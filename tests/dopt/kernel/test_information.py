@@ -217,14 +217,6 @@ def own(**fields: object) -> TrialSpec:
     return TrialSpec.from_mapping({**mapping, "policy": given})
 
 
-def test_the_numbers_of_a_users_compiled_policy_keep_their_places() -> None:
-    for fields in ({}, FRESH, FRESH | {"refresh_every": 3}):
-        spec = own(**fields)
-        assert spec.policy.kernel_numbers(10, 1.0) == (1e-3, 0.25)
-        result = run_trial(spec)
-        assert result.inputs[1:] == pytest.approx(0.25 * spec.system.gamma)
-
-
 def test_a_users_compiled_policy_has_fresh_information() -> None:
     fast = KernelTrial(own(information="fresh"))
     fast.advance(12)
