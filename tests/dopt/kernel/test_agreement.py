@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -67,46 +67,32 @@ def combined(env: str, policy: str, model: str, learner: str, form: str) -> Tria
         return None
 
 
-def first_fitting(env_policies: list[tuple[str, str]], learner: str, form: str) -> TrialSpec | None:
-    found = (
-        combined(env, policy, model, learner, form)
-        for env, policy in env_policies
-        for model in MODELS
-    )
-    return next((spec for spec in found if spec is not None), None)
+def first_fitting(**chosen: Iterable[str]) -> TrialSpec | None:
+    """Return the trial of the first choices that go together."""
+    among: dict[str, Iterable[str]] = {"env": ENVS, "policy": POLICIES, "learner": LEARNERS}
+    among |= {"model": MODELS, "form": ["auto"]} | chosen
+    choices = (dict(zip(among, one, strict=True)) for one in itertools.product(*among.values()))
+    return next((spec for one in choices if (spec := combined(**one)) is not None), None)
 
 
 OF_TRIALS = [name for name in LEARNERS if name != "simulation_error"]
 """Learners that do without a :class:`dopt.Plant`, which is measured and not simulated."""
 
 
-def cases() -> Iterator[tuple[str, TrialSpec]]:
+def cases() -> Iterator[tuple[str, TrialSpec | None]]:
     """Yield every learner in every form of M that a policy with it can hold, and every policy."""
     forms = [name for name in POLICIES if hasattr(POLICIES[name], "sketch_size")]
     for learner in OF_TRIALS:
+        yield learner, first_fitting(learner=[learner])
         for form in FORMS:
-            spec = first_fitting([(env, name) for env in ENVS for name in forms], learner, form)
-            if spec is not None:
-                yield f"{learner}-{form}", spec
-        spec = first_fitting([(env, name) for env in ENVS for name in POLICIES], learner, "auto")
-        assert spec is not None, f"learner '{learner}' goes with no policy and model"
-        yield learner, spec
+            yield f"{learner}-{form}", first_fitting(policy=forms, learner=[learner], form=[form])
     for policy in POLICIES:
-        fitting = (
-            first_fitting([(env, policy)], learner, "auto") for env in ENVS for learner in LEARNERS
-        )
-        spec = next((one for one in fitting if one is not None), None)
-        assert spec is not None, f"policy '{policy}' goes with no model and learner"
-        yield policy, spec
+        yield policy, first_fitting(policy=[policy])
     for model in MODELS:
-        pairs = itertools.product(ENVS, POLICIES, LEARNERS)
-        made = (combined(env, policy, model, learner, "auto") for env, policy, learner in pairs)
-        spec = next((one for one in made if one is not None), None)
-        assert spec is not None, f"model '{model}' goes with no policy and learner"
-        yield f"model-{model}", spec
+        yield f"model-{model}", first_fitting(model=[model])
 
 
-CASES = dict(cases())
+CASES = {name: spec for name, spec in cases() if spec is not None}
 """A trial for every choice, by the name of the choice."""
 
 

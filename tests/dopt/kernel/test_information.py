@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.func import jacrev, vmap
 
-from dopt.assessment import model_forecast
 from dopt.errors import IncompatibleError
 from dopt.kernel.learners import filter_step, whiten
 from dopt.kernel.linear_algebra import dense, initial_covariance
@@ -363,14 +362,3 @@ def test_the_growing_factor_is_that_of_a_fresh_factorisation(
     factor = np.tril(fast.state.posterior.factors[0])
     np.testing.assert_allclose(factor, np.linalg.cholesky(K), rtol=0.0, atol=1e-8 * amplitude)
     np.testing.assert_allclose(factor @ factor.T, K, rtol=0.0, atol=1e-12 * amplitude**2)
-
-
-def test_an_assessment_predicts_with_the_process() -> None:
-    spec = process("arm", env={"horizon": 20})
-    parameters, rng = run_trial(spec).parameters, np.random.default_rng(1)
-    x = rng.normal(size=(5, spec.system.n_states))
-    u = rng.normal(size=(5, 1, spec.system.n_inputs))
-    flow = np.stack(spec.system.known(tuple(x.T), tuple(u[:, 0].T), spec.system.parameters))
-    flow[list(spec.system.learned_rows)] += spec.model.predict(spec.system, parameters, x).T
-    following = model_forecast(spec.system, spec.model, parameters)(x, u)[0]
-    assert following == pytest.approx(x + spec.system.dt * flow.T, rel=1e-12)
