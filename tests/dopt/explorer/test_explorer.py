@@ -152,37 +152,17 @@ def test_the_free_run_of_a_perfect_model_has_no_error(monkeypatch: pytest.Monkey
     assert explorer.free_run_error(*recorded(105), steps=20) < 1e-12
 
 
-def test_the_same_question_has_the_same_answer() -> None:
-    explorer = Explorer(MOTOR, policy="random", steps=10)
-    first = explorer.ask([0.1, 0.0])
-    assert np.array_equal(explorer.ask([0.1, 0.0]), first)
-    assert explorer.counts["jumps"] == 0
-
-
 def test_the_applied_input_is_learned_from() -> None:
     """An input that a saturated amplifier has halved explains the half of the acceleration."""
     cut, whole = (Explorer(MOTOR, policy="random", steps=5) for _ in range(2))
-    x = np.array([0.1, 0.0])
-    cut.ask(x)
-    whole.ask(x)
-    applied = np.array([0.5])
+    x, applied = np.array([0.1, 0.0]), np.array([0.5])
+    predicted = float(cut.predict(x)[0, 0])
+    assert np.array_equal(cut.ask(x), whole.ask(x))
     cut.tell(following(x, applied), applied=applied)
     whole.tell(following(x, applied))
     assert cut.inputs[0] == 0.5
-    assert cut.errors[0] == pytest.approx(abs(motor_acceleration(x) - cut_prediction(x)), rel=1e-9)
+    assert cut.errors[0] == pytest.approx(abs(motor_acceleration(x) - predicted), rel=1e-9)
     assert not np.array_equal(cut.parameters, whole.parameters)
-
-
-def cut_prediction(x: np.ndarray) -> float:
-    return float(Explorer(MOTOR, policy="random", steps=5).predict(x)[0, 0])
-
-
-def test_a_plan_in_time_is_that_without_a_deadline() -> None:
-    with (
-        Explorer(MOTOR, steps=20, deadline=PATIENCE_SECONDS) as punctual,
-        Explorer(MOTOR, steps=20) as plain,
-    ):
-        assert np.array_equal(drive(punctual, 20), drive(plain, 20))
 
 
 def test_calls_out_of_order_are_refused() -> None:
@@ -463,17 +443,19 @@ def test_either_end_is_killed_and_the_exploration_goes_on(rig: object, tmp_path:
         assert np.isfinite(again.errors).all()
 
 
-def test_it_is_saved_and_its_answers_are_drawn(rig: object, tmp_path: Path) -> None:
+def test_it_is_saved_and_its_answers_are_drawn(
+    rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     url, picture = f"sqlite:///{tmp_path}/results.db", tmp_path / "answers.png"
     journal = ["--journal", str(tmp_path / "rig.jsonl")]
-    process = started("--seconds", "0.3", *journal, "--save", url, "--histogram", str(picture))
-    said = process.communicate(timeout=PATIENCE_SECONDS)[0]
+    words = ["rig.py", "--seconds", "0.3", *journal, "--save", url, "--histogram", str(picture)]
+    monkeypatch.setattr(sys, "argv", words)
+    rig.main()
     with reopened(rig, tmp_path / "rig.jsonl") as after, Reader.open(url) as reader:
         [config] = reader.configs()
-        curves = reader.curves(config.config_key)
-        assert np.array_equal(curves.values, [after.errors])
+        assert np.array_equal(reader.curves(config.config_key).values, [after.errors])
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert "answers: " in said
+    assert "answers: " in capsys.readouterr().out
 
 
 def test_a_motor_that_never_comes_and_a_database_that_fails_do_not_hold_it(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import math
 import os
 import signal
 import subprocess
@@ -23,9 +22,7 @@ from dopt.explorer.state import InFlight
 from dopt.fitting.model import Layout, Model
 from dopt.spec.scaled import learned_accelerations, scaled
 from dopt.systems.plant import ExploredPlant
-from dopt.systems.real import Flight
-from dopt.types import Array
-from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, motor_acceleration
+from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, Rig, motor_acceleration
 from tests.waiting import until
 
 DT = MOTOR.dt
@@ -39,19 +36,9 @@ PLANT = dataclasses.replace(
 )
 
 
-class Rig:
-    """The motor in continuous time behind a delay, in samples, and a lag [s]."""
-
-    def __init__(self, delay: float = 1.5, lag: float = 0.03) -> None:
-        self._flight, self.x, self.time = Flight(delay, lag, DT, 1), np.array([0.1, 0.0]), 0.0
-
-    def step(self, u: Array) -> Array:
-        acting = self._flight.depart(u)
-        for _ in range(20):
-            rate = 5.0 * acting[0] - 8.0 * math.sin(self.x[0]) - 0.6 * self.x[1]
-            self.x = self.x + DT / 20 * np.array([self.x[1], rate])
-        self.time += DT
-        return self.x
+def late_rig() -> Rig:
+    """Return the motor in continuous time behind a delay of 1.5 samples and a lag."""
+    return Rig(1.5, 0.03, substeps=20)
 
 
 def explorer(plant: Plant = PLANT, **more: Any) -> Explorer:
@@ -65,7 +52,7 @@ def drive(one: Explorer, rig: Rig, steps: int) -> None:
 
 
 def test_the_plant_is_found_beside_the_rig() -> None:
-    rig = Rig()
+    rig = late_rig()
     with explorer() as one:
         drive(one, rig, 400)
         assert one.counts["refits"] >= 3
@@ -79,7 +66,7 @@ def test_the_plant_is_found_beside_the_rig() -> None:
 def test_a_journal_ends_at_the_same_parameters_bit_for_bit(tmp_path: Path) -> None:
     given: dict[str, Any] = {"policy": "d_optimal", "journal": tmp_path / "run.jsonl"}
     given["learner"] = {"name": "simulation_error", "first_rows": 60, "growth": 1.0}
-    rig = Rig()
+    rig = late_rig()
     with explorer(**given) as one:
         drive(one, rig, 130)
         before = one.parameters.copy(), one.constants, dict(one.counts), one.inputs
@@ -101,7 +88,7 @@ def test_a_network_is_fitted_beside_while_samples_are_filtered(tmp_path: Path) -
         learner = {"name": "gauss_newton", "refit_every": every}
         given: dict[str, Any] = {"learner": learner, "model": WIDER, "seed": 2, "steps": 200}
         with explorer(MOTOR, journal=tmp_path / f"{every}.jsonl", **given) as one:
-            rig = Rig(0.0, 0.0)
+            rig = Rig(substeps=20)
             for _ in range(200):
                 drive(one, rig, 1)
                 until(lambda fits=one._fits: not fits or fits.is_ready or not fits.is_running)
@@ -117,9 +104,9 @@ def test_a_network_is_fitted_beside_while_samples_are_filtered(tmp_path: Path) -
 
 KILLED = """
 import sys
-from tests.dopt.explorer.test_refit import Rig, drive, explorer
+from tests.dopt.explorer.test_refit import drive, explorer, late_rig
 with explorer(journal=sys.argv[1], fsync=False) as one:
-    rig = Rig()
+    rig = late_rig()
     while True:
         drive(one, rig, 1)
         print(one.n_steps, one.counts["refits"], one.parameters.tobytes().hex(), flush=True)
@@ -183,7 +170,7 @@ def test_inputs_in_flight_are_as_if_the_delay_had_been_known(delay: float, lag: 
 
 
 def test_a_gap_a_reset_and_a_jump_begin_new_pieces() -> None:
-    rig = Rig()
+    rig = late_rig()
     with explorer() as one:
         drive(one, rig, 10)
         rig.time += 1.0  # a gap
@@ -203,7 +190,7 @@ def test_a_gap_a_reset_and_a_jump_begin_new_pieces() -> None:
 
 def test_a_state_that_is_not_measured_is_left_to_the_fit() -> None:
     plant = dataclasses.replace(PLANT, measured={"angle": encoder(4096)})
-    rig = Rig()
+    rig = late_rig()
     with explorer(plant) as one:
         for _ in range(250):
             u = one.ask(rig.x[:1], rig.time)
@@ -219,7 +206,7 @@ def test_with_a_deadline_no_fit_is_waited_for(monkeypatch: pytest.MonkeyPatch) -
         return "nothing was found"
 
     monkeypatch.setattr(FitBeside, "_ask", slow)
-    rig, learner = Rig(), {"name": "simulation_error", "first_rows": 20}
+    rig, learner = late_rig(), {"name": "simulation_error", "first_rows": 20}
     with explorer(deadline=0.5, learner=learner) as one:
         before = time.perf_counter()
         drive(one, rig, 60)
@@ -233,7 +220,7 @@ def test_a_fit_that_fails_is_said_and_the_next_one_begins(
     """And the process that fits ends with the exploration."""
     learner = {"name": "simulation_error", "first_rows": 60, "growth": 1.0}
     with caplog.at_level(logging.WARNING, logger="dopt"), explorer(learner=learner) as one:
-        rig, fits = Rig(), one._fits
+        rig, fits = late_rig(), one._fits
         assert fits is not None
         fits._thread.submit(int).result()  # until the first request is answered
         process = fits._process
