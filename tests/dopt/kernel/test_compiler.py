@@ -42,12 +42,22 @@ from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
 
-def cache_without(folder: Path, *names: str) -> dict[str, str]:
-    """Return the environment of processes whose cache is the warm one without some files."""
+def printed(program: str, *words: str, folder: Path = ROOT, **environment: str) -> str:
+    """Return what a program prints that runs in a process of its own, which may not fail."""
+    command = [sys.executable, "-c", program, *words]
+    given = os.environ | environment
+    done = subprocess.run(
+        command, env=given, cwd=folder, stdout=subprocess.PIPE, text=True, check=True
+    )
+    return done.stdout
+
+
+def cache_without(folder: Path, *names: str) -> str:
+    """Return a folder in which the cache is the warm one without some files."""
     warm_up()
     copy, without = folder / "dopt" / cache.CACHE_FOLDER.name, shutil.ignore_patterns(*names)
     shutil.copytree(cache.CACHE_FOLDER, copy, copy_function=os.symlink, ignore=without)
-    return os.environ | {"DOPT_CACHE": str(folder)}
+    return str(folder)
 
 
 @pytest.fixture
@@ -88,13 +98,12 @@ def test_what_is_in_the_cache_is_read_by_all_at_once_and_what_failed_is_not(fold
 def test_a_warm_cache_is_seen_without_the_compiler_and_a_trial_runs_without_its_rules() -> None:
     """Numba would load the rules first, for a tenth of a second in every process."""
     warm_up()
-    program = (
+    printed(
         "import sys; from dopt.kernel import warm_up; warm_up(); "
         "assert 'numba' not in sys.modules; from dopt import TrialSpec, run_trial; "
         "run_trial(TrialSpec.from_names('pendulum', 'd_optimal')); "
         "assert not {'numba.np.arraymath', 'numba.typed.typeddict'} & {*sys.modules}"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
 
 
 def test_everything_is_what_any_shipped_choice_calls() -> None:
@@ -111,27 +120,20 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
 
 def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
     """Where a trial compiles a part itself, its numbers can differ from later trials."""
-    program = (
-        "from dopt.kernel.cache import compile_missing\n"
-        "from dopt.kernel.information import add_nothing\n"
-        "from dopt.kernel.pointers import compile_form\n"
-        "from dopt.kernel.run import KernelTrial\n"
-        "from dopt.spec.trial import TrialSpec\n"
-        "compile_missing(['dopt.kernel.information.add_nothing'])\n"
-        "trial = KernelTrial(TrialSpec.from_names('pendulum', 'random')).trial\n"
-        "compile_form(trial, 'add_rows', add_nothing)\n"
-        "stats = add_nothing.stats\n"
-        "print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env=cache_without(tmp_path, "*add_nothing*"),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.split() == ["1", "0"]
-    assert "0 of 1 parts" in done.stderr
+    program = """
+from dopt.kernel.cache import compile_missing, missing
+from dopt.kernel.information import add_nothing
+from dopt.kernel.pointers import compile_form
+from dopt.kernel.run import KernelTrial
+from dopt.spec.trial import TrialSpec
+part = "dopt.kernel.information.add_nothing"
+assert missing([part]) == [part]
+compile_missing([part])
+trial = KernelTrial(TrialSpec.from_names("pendulum", "random")).trial
+compile_form(trial, "add_rows", add_nothing)
+print(sum(add_nothing.stats.cache_hits.values()), sum(add_nothing.stats.cache_misses.values()))
+"""
+    assert printed(program, DOPT_CACHE=cache_without(tmp_path, "*add_nothing*")) == "1 0\n"
 
 
 GRID = {
@@ -161,50 +163,35 @@ def test_a_grid_compiles_what_its_trials_ask_for_and_no_more(
 
 
 def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: Path) -> None:
-    program = (
-        "import sys\n"
-        "from dopt.kernel import compiling\n"
-        "from dopt.spec.trial import TrialSpec\n"
-        "system = {'name': 'mass_spring', 'horizon': int(sys.argv[1])}\n"
-        "with compiling([TrialSpec.from_names(system, 'random').config]):\n"
-        "    print('numba' in sys.modules)\n"
-    )
-    environment = cache_without(tmp_path, "kinds-*")
-    answers = [
-        subprocess.run(
-            [sys.executable, "-c", program, horizon],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for horizon in ("100", "200")
-    ]
+    program = """
+import sys
+from dopt.kernel import compiling
+from dopt.spec.trial import TrialSpec
+system = {"name": "mass_spring", "horizon": int(sys.argv[1])}
+with compiling([TrialSpec.from_names(system, "random").config]):
+    print("numba" in sys.modules)
+"""
+    folder = cache_without(tmp_path, "kinds-*")
+    answers = [printed(program, horizon, DOPT_CACHE=folder) for horizon in ("100", "200")]
     assert answers == ["True\n", "False\n"]
 
 
 def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
     """The same sources in another folder: nothing is compiled, and the numbers are the same."""
-    program = (
-        "import numpy as np\n"
-        "from dopt.kernel.equations import compiled_equations\n"
-        "from dopt.systems import SYSTEMS\n"
-        "function = compiled_equations(SYSTEMS['pendulum']()).accelerations\n"
-        "out = np.empty(1)\n"
-        "function(np.ones(2), np.array(SYSTEMS['pendulum']().parameters), out)\n"
-        "print(sum(function.stats.cache_misses.values()), out[0].hex())\n"
-    )
+    program = """
+import numpy as np
+from dopt.kernel.equations import compiled_equations
+from dopt.systems import SYSTEMS
+function = compiled_equations(SYSTEMS["pendulum"]()).accelerations
+out = np.empty(1)
+function(np.ones(2), np.array(SYSTEMS["pendulum"]().parameters), out)
+print(sum(function.stats.cache_misses.values()), out[0].hex())
+"""
     shutil.copytree(ROOT / "dopt", tmp_path / "elsewhere/dopt")
+    folder = str(tmp_path / "cache")
     (missed, number), (again, same) = (
-        subprocess.run(
-            [sys.executable, "-c", program],
-            env=os.environ | {"DOPT_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(checkout)},
-            cwd=checkout,
-            stdout=subprocess.PIPE,
-            text=True,
-            check=True,
-        ).stdout.split()
-        for checkout in (ROOT, tmp_path / "elsewhere")
+        printed(program, folder=one, DOPT_CACHE=folder, PYTHONPATH=str(one)).split()
+        for one in (ROOT, tmp_path / "elsewhere")
     )
     assert (missed, again) == ("1", "0")
     assert number == same
@@ -213,43 +200,41 @@ def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
 def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_path: Path) -> None:
     """Whoever opened the second would compile its argument, without what its module prepares."""
     (tmp_path / "pair.py").write_text(
-        "from pathlib import Path\n"
-        "from dopt.kernel import compiler\n"
-        "compiler._PACKAGE = Path(__file__).parent\n"
-        "from dopt.kernel.compiler import compiled\n"
-        "@compiled\n"
-        "def inner(x):\n"
-        "    return x + 1.0\n"
-        "@compiled\n"
-        "def outer(x):\n"
-        "    return 2.0 * inner(x)\n"
-        "@compiled\n"
-        "def applied(functions, x):\n"
-        "    return 2.0 * functions[0](x)\n"
-        "assert outer(1.0) == applied((inner,), 1.0) == 4.0\n"
+        """
+from pathlib import Path
+from dopt.kernel import compiler
+compiler._PACKAGE = Path(__file__).parent
+from dopt.kernel.compiler import compiled
+@compiled
+def inner(x):
+    return x + 1.0
+@compiled
+def outer(x):
+    return 2.0 * inner(x)
+@compiled
+def applied(functions, x):
+    return 2.0 * functions[0](x)
+assert outer(1.0) == applied((inner,), 1.0) == 4.0
+"""
     )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, tmp_path / "pair.py"], check=True, env=environment)
+    printed("import pair", folder=tmp_path, DOPT_CACHE=str(tmp_path / "cache"))
     found = [path.name.partition("-")[0] for path in tmp_path.rglob("*.nbi")]
     assert found == ["pair.outer"]
 
 
 def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path: Path) -> None:
     """And is gone with the process that made it."""
-    program = (
-        "import subprocess, sys\n"
-        "from dopt.kernel.cache import CACHE_FOLDER\n"
-        "print(CACHE_FOLDER)\n"
-        "if len(sys.argv) < 2:\n"
-        "    subprocess.run([sys.executable, __file__, 'child'], check=True)\n"
-        "print(CACHE_FOLDER.is_dir())\n"
-    )
-    (tmp_path / "program.py").write_text(program)
+    program = """
+import subprocess, sys
+from dopt.kernel.cache import CACHE_FOLDER
+print(CACHE_FOLDER, flush=True)
+if len(sys.argv) < 3:
+    subprocess.run([sys.executable, "-c", sys.argv[1], sys.argv[1], "child"], check=True)
+print(CACHE_FOLDER.is_dir())
+"""
     (tmp_path / "file").touch()
-    given = {**os.environ, "PYTHONPATH": str(ROOT), "DOPT_CACHE": str(tmp_path / "file" / "cache")}
-    command = [sys.executable, "-u", str(tmp_path / "program.py")]
-    done = subprocess.run(command, env=given, check=True, capture_output=True, text=True)
-    made, used, there, still_there = done.stdout.split()
+    said = printed(program, program, DOPT_CACHE=str(tmp_path / "file" / "cache"))
+    made, used, there, still_there = said.split()
     assert (made, there, still_there) == (used, "True", "True")
     assert not Path(made).exists()
 
@@ -352,9 +337,9 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 assert not isinstance(loop.advance, Dispatcher)
 found = []
-for mapping in json.load(sys.stdin):
+for mapping in json.loads(sys.argv[1]):
     result = run_trial(TrialSpec.from_mapping(mapping))
-    found.append({name: getattr(result, name).tolist() for name in sys.argv[1:]})
+    found.append({name: getattr(result, name).tolist() for name in sys.argv[2:]})
 print(json.dumps(found))
 """
 EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
@@ -364,16 +349,9 @@ EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
 @pytest.fixture(scope="module")
 def plain() -> list[dict[str, Any]]:
     given = json.dumps([spec.to_mapping() for spec in TRIALS])
-    done = subprocess.run(
-        [sys.executable, "-c", PLAIN_PROGRAM, *EXACT, *SINGLE],
-        input=given,
-        env=os.environ | {"DOPT_PLAIN": "1"},
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
+    found: list[dict[str, Any]] = json.loads(
+        printed(PLAIN_PROGRAM, given, *EXACT, *SINGLE, DOPT_PLAIN="1")
     )
-    found: list[dict[str, Any]] = json.loads(done.stdout)
     return found
 
 
