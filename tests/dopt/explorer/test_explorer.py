@@ -123,9 +123,7 @@ def test_accelerations_of_another_size_are_warned_of_once() -> None:
     assert len(warned) == 1
 
 
-def test_the_trial_of_an_environment_is_explored_without_starting_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_environment_is_explored_without_starting_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """An environment is driven through the same door, by the program that steps it."""
     monkeypatch.syspath_prepend(str(EXAMPLE))
     from swing import Swing
@@ -269,9 +267,7 @@ def test_numbers_of_numpy_describe_the_same_exploration() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_test_run_that_has_no_error_is_refused_and_not_stored(
-    value: float, tmp_path: Path
-) -> None:
+def test_a_test_run_without_an_error_is_not_stored(value: float, tmp_path: Path) -> None:
     url, states, inputs = f"sqlite:///{tmp_path}/results.db", STATES.copy(), INPUTS.copy()
     with explorer() as run:
         drive(run, 5)

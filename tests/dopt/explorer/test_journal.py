@@ -56,7 +56,7 @@ def driven(journal: Path, steps: int) -> Array:
 ABOUT: dict[str, Any] = {"format": 1, "trial": {}}
 
 
-def test_the_name_of_a_new_journal_is_on_the_disk(
+def test_the_name_of_a_journal_is_on_the_disk(
     journal: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[str] = []
@@ -203,9 +203,7 @@ def test_a_beginning_that_is_torn_is_begun_again(journal: Path) -> None:
     assert json.loads(journal.read_text())["format"] == FORMAT
 
 
-def test_what_cannot_be_read_is_refused_and_freed(
-    journal: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_read_is_refused(journal: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: Path) -> bytes:
         raise PermissionError(13, "Permission denied")
 
@@ -244,7 +242,7 @@ def test_a_full_disk_ends_the_exploration(journal: Path) -> None:
         assert again.n_steps == 3
 
 
-def test_what_is_told_is_on_the_disk_before_the_call_returns(
+def test_what_is_told_is_on_the_disk_at_once(
     journal: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[int] = []
@@ -268,7 +266,7 @@ def test_a_fork_does_not_write_into_the_journal(journal: Path) -> None:
             explorer.ask(x)
 
 
-def test_a_journal_from_elsewhere_is_replayed_with_a_warning(
+def test_a_journal_from_elsewhere_is_replayed(
     journal: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Another processor rounds differently; the exploration goes on with what it was told."""
@@ -390,7 +388,7 @@ def test_each_bit_of_a_journal_is_checked(journal: Path, lines: list[bytes]) -> 
             Journal(journal, False, {"format": FORMAT, "trial": {}})
 
 
-def test_a_line_that_is_removed_repeated_swapped_or_added_is_refused(
+def test_removed_repeated_swapped_or_added_lines_are_refused(
     journal: Path, lines: list[bytes]
 ) -> None:
     for i in range(1, len(lines) - 1):

@@ -108,7 +108,7 @@ def test_states_in_vain_or_never_told_are_said_once(
     assert said(caplog, words) == 1
 
 
-def test_a_clock_that_began_anew_is_said_and_followed_after_a_reset(
+def test_a_reset_follows_a_clock_that_began_anew(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     journal = tmp_path / "run.jsonl"

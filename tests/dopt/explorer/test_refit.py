@@ -214,9 +214,7 @@ def test_with_a_deadline_no_fit_is_waited_for(monkeypatch: pytest.MonkeyPatch) -
         assert one.counts["refits"] == 0
 
 
-def test_a_fit_that_fails_is_said_and_the_next_one_begins(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_fit_that_fails_is_said_and_the_next_one_begins(caplog: pytest.LogCaptureFixture) -> None:
     """And the process that fits ends with the exploration."""
     learner = {"name": "simulation_error", "first_rows": 60, "growth": 1.0}
     with caplog.at_level(logging.WARNING, logger="dopt"), explorer(learner=learner) as one:

@@ -110,7 +110,7 @@ def test_a_merge_takes_it_and_what_it_has_grown_by(url: str, tmp_path: Path, run
     assert not examine(target, trial_key)
 
 
-def test_another_run_of_the_same_arguments_is_kept_apart(
+def test_another_run_of_these_arguments_stays_apart(
     url: str, tmp_path: Path, run: Explorer
 ) -> None:
     run.save(url)
@@ -189,7 +189,7 @@ def test_it_is_not_compared_with_simulated_trials(sqlite_url: str) -> None:
             compare_policies(reader, selection)
 
 
-def test_the_caption_of_its_curve_names_no_grid(
+def test_the_caption_of_a_curve_names_no_grid(
     sqlite_url: str, run: Explorer, tmp_path: Path
 ) -> None:
     run.save(sqlite_url)
@@ -228,9 +228,7 @@ def test_a_database_that_is_gone_is_said_and_written_anew(
 
 
 @pytest.mark.parametrize("table", ["trial", "launch"])
-def test_rows_that_were_deleted_by_hand_are_said(
-    table: str, sqlite_url: str, run: Explorer
-) -> None:
+def test_rows_deleted_by_hand_are_said(table: str, sqlite_url: str, run: Explorer) -> None:
     run.save(sqlite_url)
     with sqlite3.connect(sqlite_url.removeprefix("sqlite:///")) as connection:
         connection.execute(f"DELETE FROM {table}")
@@ -241,7 +239,7 @@ def test_rows_that_were_deleted_by_hand_are_said(
     run.close()
 
 
-def test_what_is_stored_is_what_was_explored(
+def test_stored_is_what_was_explored(
     url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without a URL it is the database of the launches; and nothing is before the first step."""
@@ -281,7 +279,7 @@ def test_an_exploration_by_a_policy_of_a_script_is_saved(sqlite_url: str) -> Non
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_saved_while_it_grows_is_saved_at_the_end(
+def test_saved_on_the_way_is_saved_at_the_end(
     closed: bool, url: str, tmp_path: Path, run: Explorer
 ) -> None:
     for steps in (0, 1, 3, 130):

@@ -51,7 +51,7 @@ def test_a_motor_as_declared_shows_no_sign(caplog: pytest.LogCaptureFixture) -> 
 
 
 @pytest.mark.parametrize("delay", [1, 3])
-def test_an_undeclared_delay_is_said_with_its_samples(
+def test_an_undeclared_delay_is_said_in_samples(
     caplog: pytest.LogCaptureFixture, delay: int
 ) -> None:
     with explorer(steps=STEPS) as one:
@@ -77,7 +77,7 @@ def test_gaps_are_no_part_of_the_test_for_a_delay() -> None:
         assert one.counts["late"] > 0
 
 
-def test_other_inputs_than_asked_are_counted_and_said_once(
+def test_inputs_other_than_asked_are_said_once(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     def go(one: Explorer, steps: int) -> None:
@@ -133,9 +133,7 @@ def test_states_beyond_the_limits_are_counted(caplog: pytest.LogCaptureFixture) 
     assert not any("beyond the limits" in text for text in said(caplog))
 
 
-def test_merged_samples_may_leave_parameters_until_the_next_fit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_merged_samples_may_leave_parameters_until_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gaussian_process, "MOST_SAMPLES", 60)
     model = {"name": "gaussian_process", "hyperparameters": "evidence"}
     with explorer(model=model, learner={"name": "conditioning", "growth": 3.0}, steps=600) as one:

@@ -92,7 +92,7 @@ def others() -> list[Fitted]:
     return [fit(**one) for one in [*options, {"width": 2, "weights": (10.0,)}]]
 
 
-def test_the_same_fit_has_one_row_and_another_its_own(
+def test_a_fit_has_one_row_and_another_its_own(
     url: str, found: Fitted, others: list[Fitted]
 ) -> None:
     key = found.store(url)

@@ -229,7 +229,7 @@ def test_the_cases_cover_the_registries_and_the_forms() -> None:
 
 
 @pytest.mark.parametrize("registry", [POLICIES, LEARNERS, MODELS])
-def test_every_class_says_whether_it_is_compiled(
+def test_classes_say_if_they_are_compiled(
     registry: dict[str, type[Policy | Learner | Model]],
 ) -> None:
     for name, cls in registry.items():
@@ -356,9 +356,7 @@ INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(
         ("policy", "nan", INPUT.format(r"array\(\[nan\]\)")),
     ],
 )
-def test_what_a_part_of_ones_own_returns_is_checked(
-    part: str, what: str, sentence: str, path: Path
-) -> None:
+def test_what_own_parts_return_is_checked(part: str, what: str, sentence: str, path: Path) -> None:
     own: Any = {"policy": Bringing(what=what), "learner": Teaching(what=what)}[part]
     system = SYSTEMS["pendulum"](horizon=5, grid_points=(4, 4))
     spec = TrialSpec.of_system(system, **({"policy": "random"} | {part: own}))

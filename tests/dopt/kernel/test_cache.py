@@ -123,9 +123,7 @@ def test_what_is_damaged_is_compiled_again_and_said(
 
 
 @pytest.mark.usefixtures("folder")
-def test_code_is_found_until_a_constant_of_its_file_changes(
-    triple: FunctionType, tmp_path: Path
-) -> None:
+def test_a_changed_constant_makes_other_code(triple: FunctionType, tmp_path: Path) -> None:
     """The function itself stays the same, and so does what it returns."""
     assert not found(triple)
     assert found(triple)
@@ -215,9 +213,7 @@ def read_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return here
 
 
-def test_a_cache_that_can_only_be_read_is_used(
-    read_only: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_read_only_cache_is_used(read_only: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is missing goes beside links to what is there, also for other processes."""
     monkeypatch.setattr(cache, "CACHE_FOLDER", cache._cache_folder())
     assert read_only != cache.CACHE_FOLDER
@@ -230,7 +226,7 @@ def test_a_cache_that_can_only_be_read_is_used(
     assert (read_only / "some/code.nbi").read_bytes().endswith(b"code")
 
 
-def test_without_a_temporary_folder_what_is_there_is_read(
+def test_no_temporary_folder_is_needed_to_read(
     read_only: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "mkdtemp", no_space)
@@ -290,7 +286,7 @@ class TestDigest:
         monkeypatch.setenv(f"NUMBA_{name}", value)
         assert (cache._source_digest() != usual) is changes_the_code
 
-    def test_unlike_processors_share_the_code_of_a_common_one_alone(
+    def test_unlike_processors_share_no_code_but_generic(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """Two of the same name may offer different parts of it, as in a virtual machine."""
@@ -431,9 +427,7 @@ def as_before(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(owner, name, getattr(owner, name))
 
 
-def test_callers_give_their_numbers_and_callees_have_no_code(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_callees_have_no_code_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """And callees are optimized in their callers alone."""
     optimized: list[str] = []
 

@@ -147,7 +147,7 @@ GRID = {
 
 
 @pytest.mark.parametrize("name", GRID)
-def test_a_grid_compiles_what_its_trials_ask_for_and_no_more(
+def test_a_grid_compiles_what_its_trials_ask_for(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """A part that were missing would be compiled while the workers wait for it."""

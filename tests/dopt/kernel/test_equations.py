@@ -100,9 +100,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("spec", CASES, ids=lambda spec: spec.system.name)
-def test_the_numbers_do_not_depend_on_the_pieces(
-    spec: TrialSpec, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numbers_do_not_depend_on_pieces(spec: TrialSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = run_trial_in_kernel(spec)
     lasts: list[int] = []
     advance = KernelTrial.advance
@@ -177,9 +175,7 @@ def spec_of(env: str, lookahead: int, replan_every: int, hold: int) -> TrialSpec
 
 
 @pytest.mark.parametrize(("replan_every", "hold"), [(2, 1), (6, 3), (11, 10)])
-def test_between_two_searches_the_inputs_are_those_of_the_plan(
-    replan_every: int, hold: int
-) -> None:
+def test_between_two_searches_inputs_are_those_of_the_plan(replan_every: int, hold: int) -> None:
     spec = spec_of("arm", 11, replan_every, hold)
     policy = spec.policy
     assert isinstance(policy, Episodic)

@@ -194,7 +194,7 @@ def with_learner(name: str) -> dict[str, Any]:
         ("arm", {"policy": {"refresh_every": 2}}, "policy.refresh_every 2 goes with policy.inform"),
     ],
 )
-def test_fresh_information_needs_the_primal_form_of_a_matrix_of_its_own(
+def test_fresh_information_needs_a_primal_matrix_of_its_own(
     env: str, sections: Any, said: str
 ) -> None:
     with pytest.raises(IncompatibleError, match=said):

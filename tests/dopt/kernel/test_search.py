@@ -30,9 +30,7 @@ SMALL = {"lookahead": 7, "hold": 3, "stride": 2, "plans": 9, "iterations": 2, "e
 @pytest.mark.parametrize(
     ("policy", "dt"), [("exact", 1e-5), ("trace", 1e-5), ("trace_linearized", 0.02)]
 )
-def test_with_one_input_and_a_short_step_the_sign_is_that_of_d_optimal(
-    policy: str, dt: float
-) -> None:
+def test_of_one_input_and_a_short_step_the_sign_is_d_optimal(policy: str, dt: float) -> None:
     """For dt → 0 the linearisation in u is exact, and one component has one variance."""
     found, expected = (
         run_trial(trial("pendulum", name, 2, env={"horizon": 40, "dt": dt})).inputs
@@ -153,9 +151,7 @@ UNFIT: list[tuple[str, dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("policy", "fields", "message"), [*WRONG, *UNFIT])
-def test_a_wrong_field_is_answered_by_one_sentence(
-    policy: str, fields: dict[str, Any], message: str
-) -> None:
+def test_a_wrong_field_has_one_sentence(policy: str, fields: dict[str, Any], message: str) -> None:
     with pytest.raises(SpecificationError, match=message) as caught:
         trial("pendulum", policy, policy=fields)
     unfit = (policy, fields, message) in UNFIT

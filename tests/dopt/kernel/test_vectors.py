@@ -110,7 +110,7 @@ def test_each_sum_of_a_product_is_taken_in_order(n: int, k: int) -> None:
 
 
 @given(SIZES, PRECISIONS, st.integers(0, 99))
-def test_a_multiple_is_added_to_a_vector_alone(
+def test_a_multiple_changes_its_vector_alone(
     n: int, precision: tuple[type, float], seed: int
 ) -> None:
     kind, error = precision
@@ -123,9 +123,7 @@ def test_a_multiple_is_added_to_a_vector_alone(
 
 
 @given(st.integers(1, 70), st.integers(1, 2 * GROUP + 1), st.integers(0, 99))
-def test_products_with_a_symmetric_matrix_read_its_upper_blocks_alone(
-    q: int, k: int, seed: int
-) -> None:
+def test_symmetric_products_read_the_upper_blocks_alone(q: int, k: int, seed: int) -> None:
     """And a product has the same bits whichever others share the pass."""
     rng = np.random.default_rng(seed)
     Q = padded(q)

@@ -113,7 +113,7 @@ def test_torques_are_those_of_the_engine(arm: Body) -> None:
 
 
 @pytest.mark.parametrize("name", ["mass", "com", "inertia", "armature", "damping"])
-def test_regressors_are_derivatives_of_the_torques_of_the_engine(
+def test_regressors_are_derivatives_of_the_engine_s_torques(
     arm: Body, limits: Limits, name: str
 ) -> None:
     unknowns = Unknowns(arm, limits, name)
@@ -280,9 +280,7 @@ def test_a_slide_has_units_of_its_own(arm: Body, limits: Limits) -> None:
         ("", "no unknown parameter is given"),
     ],
 )
-def test_parameters_that_are_wrong_are_named(
-    arm: Body, limits: Limits, wanted: str, said: str
-) -> None:
+def test_wrong_parameters_are_named(arm: Body, limits: Limits, wanted: str, said: str) -> None:
     with pytest.raises(SpecificationError, match=said):
         Unknowns(arm, limits, wanted)
 

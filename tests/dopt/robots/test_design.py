@@ -176,7 +176,7 @@ def test_the_best_searched_family_has_the_whole_effort(arm: Body, limits: Limits
 
 @pytest.mark.parametrize("name", ["seconds", "noise", "rate"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_numbers_of_a_problem_are_positive(
+def test_numbers_of_problems_are_positive(
     arm: Body, limits: Limits, name: str, value: float
 ) -> None:
     with pytest.raises(SpecificationError, match=f"{name} of a design is .* but a number above 0"):
