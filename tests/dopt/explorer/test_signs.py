@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 import dopt.explorer.explorer as module
 from analysis.serve.app import create_app
 from dopt import Explorer
-from dopt.explorer.signs import EXPLAINED, SIGNS, explained
+from dopt.explorer.signs import SIGNS
 from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.types import Array
@@ -183,18 +183,3 @@ def test_signs_are_stored_and_shown(tmp_path: Path) -> None:
         key = reader.rows("SELECT trial_key FROM v_trial")[0].trial_key
     page = TestClient(create_app(url), base_url="http://127.0.0.1").get(f"/trials/{key}").text
     assert f"<dt>{SIGNS['late']}</dt><dd>1</dd>" in page
-
-
-def test_what_earlier_inputs_explain_is_a_share_of_what_is_left_of_the_errors() -> None:
-    rng = np.random.default_rng(0)
-    given, earlier = rng.standard_normal((500, 3)), rng.standard_normal((500, 4))
-    earlier[:, 0] = given[:, 0]  # follows from what is given
-    errors = given @ rng.standard_normal((3, 2)) + rng.standard_normal((500, 2))
-    errors[:, 1] += 3.0 * earlier[:, 2]
-    shares, sizes, lag = explained(errors, given, earlier)
-    assert lag == 3
-    assert shares[1] == pytest.approx(0.9, abs=0.02)
-    assert sizes[1] == pytest.approx(3.0, rel=0.1)
-    assert shares[0] < 0.1 * EXPLAINED
-    shares, sizes, _ = explained(errors, given, np.repeat(given[:, :1], 4, axis=1))
-    assert shares.tolist() == sizes.tolist() == [0.0, 0.0]

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from dopt.algorithm import Score, switch_step
+from dopt.algorithm import Score
 from dopt.errors import SpecificationError
 from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
@@ -314,11 +314,6 @@ def test_every_score_has_a_name_and_each_policy_that_searches_one_of_them() -> N
     assert list(SCORES.values()) == list(Score)
     searching = [cls() for cls in POLICIES.values() if issubclass(cls, Search)]
     assert {score_code(policy) for policy in searching} >= set(Score) - {Score.JOINT}
-
-
-@pytest.mark.parametrize(("steps", "switch"), [(1, 1), (2, 1), (5, 2), (6, 3)])
-def test_plans_switch_half_way(steps: int, switch: int) -> None:
-    assert switch_step(steps) == switch
 
 
 NETWORK = {"name": "mlp", "width": 3, "depth": 1}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -188,36 +189,31 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping() -> None:
 
     from dopt.robots.sysid import sequences
 
-    body = body_of("""<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
+    body = body_of(
+        """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
       <joint name="a" axis="0 1 0" damping="0.8"/>
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
       <body pos="0.3 0 0"><joint name="b" axis="0 1 0" damping="0.3"/>
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" contype="0" conaffinity="0"/>
-      </body></body></worldbody></mujoco>""")
-    data = mujoco.MjData(body.model)
-    times = 0.002 * np.arange(700)
+      </body></body></worldbody></mujoco>"""
+    )
+    data, times = mujoco.MjData(body.model), 0.002 * np.arange(700)
     torques = np.stack([4.0 * np.sin(3.0 * times), 2.0 * np.sin(5.0 * times)], axis=1)
-    positions = []
-    for row in torques:
-        positions.append(data.qpos.copy())
+    q = np.zeros((700, 2))
+    for k, row in enumerate(torques):
+        q[k] = data.qpos
         data.qfrc_applied[:] = row
         mujoco.mj_step(body.model, data)
-    q = np.array(positions)
-    log = pd.DataFrame(
-        {"time": 5.0 + times, "q_a": q[:, 0], "q_b": q[:, 1]}
-        | {"tau_a": torques[:, 0], "tau_b": torques[:, 1]}
-    )
-    found = sequences(body, log)
-    parameters = sysid.ParameterDict()
+    columns = {"q_a": q[:, 0], "q_b": q[:, 1], "tau_a": torques[:, 0], "tau_b": torques[:, 1]}
+    log = pd.DataFrame({"time": 5.0 + times, **columns})
+    found, parameters = sequences(body, log), sysid.ParameterDict()
     for joint in body.joints:
 
-        def change(spec: object, one: object, joint: str = joint) -> None:
-            value = float(np.ravel(one.value)[0])  # type: ignore[attr-defined]  # of a library
-            spec.joint(joint).damping = [value, 0.0, 0.0]  # type: ignore[attr-defined]
+        def change(spec: Any, one: Any, joint: str = joint) -> None:
+            spec.joint(joint).damping = [float(np.ravel(one.value)[0]), 0.0, 0.0]
 
-        parameters.add(
-            sysid.Parameter(joint, nominal=0.5, min_value=0.01, max_value=5.0, modifier=change)
-        )
+        how = {"nominal": 0.5, "min_value": 0.01, "max_value": 5.0, "modifier": change}
+        parameters.add(sysid.Parameter(joint, **how))
     residual = sysid.build_residual_fn(models_sequences=[found])
     fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False)
     assert fitted["a"].value == pytest.approx(0.8, rel=0.02)

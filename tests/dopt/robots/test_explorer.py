@@ -14,7 +14,7 @@ from dopt.robots.body import Body
 from dopt.robots.explorer import LOST, RobotExplorer
 from dopt.robots.friction import SPEEDS
 from dopt.robots.limits import Limits
-from dopt.robots.tracking import Guard, KnownBody
+from dopt.robots.tracking import Guard
 from studies.robots.online import LOOK, Trace, explore, true_values
 from studies.robots.simulated import SimulatedRobot, jaco
 
@@ -179,22 +179,6 @@ def test_a_payload_is_noticed_said_once_and_weighed() -> None:
     assert "payload" in explorer.warnings[0]
     assert explorer.known.model.body_mass[body.moved[-1]] - own == pytest.approx(0.8, abs=0.15)
     assert body.model.body_mass[body.moved[-1]] == own
-
-
-def test_a_hung_point_mass_adds_its_gravity_and_inertia() -> None:
-    body = small()[0]
-    known, last = KnownBody(body), body.moved[-1]
-    place, mass = np.array([0.3, 0.05, -0.1]), 0.7
-    known.hang(mass, mass * place)
-    spec = mujoco.MjSpec.from_string(ARM)
-    held = spec.bodies[last].add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-4, 0, 0])
-    held.pos, held.mass = place, mass
-    expected = KnownBody(Body(spec.compile()))
-    q, v, a = np.array([0.3, -0.6, 0.9]), np.array([1.0, -0.5, 2.0]), np.array([3.0, 2.0, -1.0])
-    zero = np.zeros(3)
-    np.testing.assert_allclose(known.inverse(q, zero, zero), expected.inverse(q, zero, zero))
-    # The inertia of the estimate is about any axis: it is the larger one.
-    np.testing.assert_allclose(known.inverse(q, v, a), expected.inverse(q, v, a), rtol=0.35)
 
 
 @pytest.mark.parametrize("friction", ["coulomb_viscous", "network"])
