@@ -328,16 +328,18 @@ def test_room_is_the_distance_beyond_the_one_to_keep() -> None:
     assert levers == pytest.approx([np.hypot(0.5, 0.5) + 0.03, 1.0], abs=0.02)
 
 
-def test_without_mujoco_one_sentence_says_what_to_install() -> None:
+def test_without_mujoco_one_sentence_says_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(ARM)
     text = """
 import sys
 sys.modules["mujoco"] = None
 from dopt.errors import SpecificationError
 from dopt.robots import Body, RobotExplorer
 try:
-    Body.load("arm.xml")
+    Body.load(sys.argv[1])
 except SpecificationError as error:
     print(error)
 """
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", text, tmp_path / "arm.xml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout

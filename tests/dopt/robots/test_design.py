@@ -184,12 +184,12 @@ def test_numbers_of_problems_are_positive(
         Problem(arm, limits, "damping", **({"seconds": 5.0} | {name: value}))
 
 
-def test_a_log_for_the_fits_of_mujoco_recovers_damping() -> None:
+def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
     from mujoco import sysid
 
     from dopt.robots.sysid import sequences
 
-    body = body_of(
+    (tmp_path / "two.xml").write_text(
         """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
       <joint name="a" axis="0 1 0" damping="0.8"/>
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
@@ -197,6 +197,7 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping() -> None:
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" contype="0" conaffinity="0"/>
       </body></body></worldbody></mujoco>"""
     )
+    body = Body.load(tmp_path / "two.xml")
     data, times = mujoco.MjData(body.model), 0.002 * np.arange(700)
     torques = np.stack([4.0 * np.sin(3.0 * times), 2.0 * np.sin(5.0 * times)], axis=1)
     q = np.zeros((700, 2))
