@@ -439,19 +439,16 @@ def test_either_end_is_killed_and_the_exploration_goes_on(rig: object, tmp_path:
         assert np.isfinite(again.errors).all()
 
 
-def test_it_is_saved_and_its_answers_are_drawn(
-    rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_saved_and_its_answers_are_drawn(rig: object, tmp_path: Path) -> None:
     url, picture = f"sqlite:///{tmp_path}/results.db", tmp_path / "answers.png"
     journal = ["--journal", str(tmp_path / "rig.jsonl")]
-    words = ["rig.py", "--seconds", "0.3", *journal, "--save", url, "--histogram", str(picture)]
-    monkeypatch.setattr(sys, "argv", words)
-    rig.main()
+    process = started("--seconds", "0.3", *journal, "--save", url, "--histogram", str(picture))
+    said = process.communicate(timeout=PATIENCE_SECONDS)[0]
     with reopened(rig, tmp_path / "rig.jsonl") as after, Reader.open(url) as reader:
         [config] = reader.configs()
         assert np.array_equal(reader.curves(config.config_key).values, [after.errors])
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert "answers: " in capsys.readouterr().out
+    assert "answers: " in said
 
 
 def test_a_motor_that_never_comes_and_a_database_that_fails_do_not_hold_it(

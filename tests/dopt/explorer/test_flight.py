@@ -44,11 +44,11 @@ def error(explorer: Explorer) -> float:
     "rig", [{"delay": 1.7 * DT}, {"delay": 2 * DT, "lag": 0.03, "supply": 5.0}], ids=str
 )
 def test_what_is_declared_is_recovered_as_without_it(rig: dict[str, float]) -> None:
-    explorer = explored(declared(**rig), known := behind(rig), 150)
+    explorer = explored(declared(**rig), known := behind(rig))
     np.testing.assert_allclose(explorer.inputs, known.acted, atol=1e-12)
     assert np.abs(explorer.inputs).max() <= rig.get("supply", 6.0) + 1e-12
     assert error(explorer) < 0.5
-    assert error(explored(MOTOR, behind(rig), 150)) > 5.0
+    assert error(explored(MOTOR, behind(rig))) > 5.0
 
 
 def test_the_first_guess_of_an_unknown_delay_is_taken_also_by_a_policy_that_searches() -> None:

@@ -56,7 +56,7 @@ def test_unusable_states_end_a_transition(value: float) -> None:
     assert np.array_equal(explorer.parameters, before)
     assert explorer.counts["unusable"] == 1
     assert explorer.tell(following(x, explorer.ask(x)), time=0.08)
-    assert explorer.ask([value, 0.0], time=0.08) == 0.3
+    assert explorer.ask([0.0, value], time=0.08) == 0.3
     assert explorer.counts["unusable"] == 2
     assert not explorer.tell([0.2, 0.0], time=0.1)  # from which it goes on
 

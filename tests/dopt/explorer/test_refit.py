@@ -23,7 +23,6 @@ from tests.waiting import until
 
 DT = MOTOR.dt
 SMALL = {"name": "mlp", "depth": 1, "width": 6}
-WIDER = SMALL | {"width": 12}
 PLANT = dataclasses.replace(
     MOTOR,
     constants={"gain": unknown(8.0)},
@@ -61,10 +60,9 @@ def test_the_plant_is_found_beside_the_rig() -> None:
 
 def test_a_journal_ends_at_the_same_parameters_bit_for_bit(tmp_path: Path) -> None:
     given: dict[str, Any] = {"policy": "d_optimal", "journal": tmp_path / "run.jsonl"}
-    given["learner"] = {"name": "simulation_error", "first_rows": 60, "growth": 1.0}
     rig = late_rig()
     with explorer(**given) as one:
-        drive(one, rig, 130)
+        drive(one, rig, 195)
         before = one.parameters.copy(), one.constants, dict(one.counts), one.inputs
         planned = one.ask(rig.x, rig.time)
     with explorer(**given) as again:
@@ -73,7 +71,7 @@ def test_a_journal_ends_at_the_same_parameters_bit_for_bit(tmp_path: Path) -> No
         for left, right in zip(before, after, strict=True):
             assert left == right if isinstance(left, dict) else (left == right).all()
         np.testing.assert_array_equal(again.ask(rig.x, rig.time), planned)
-        drive(again, rig, 120)
+        drive(again, rig, 60)
         assert again.counts["refits"] > before[2]["refits"]
 
 
@@ -82,7 +80,7 @@ def test_a_network_is_fitted_beside_while_samples_are_filtered(tmp_path: Path) -
     missed = {}
     for every in (0, 400):
         learner = {"name": "gauss_newton", "refit_every": every}
-        given: dict[str, Any] = {"learner": learner, "model": WIDER, "seed": 2, "steps": 200}
+        given: dict[str, Any] = {"learner": learner, "model": "mlp", "seed": 2, "steps": 200}
         with explorer(MOTOR, journal=tmp_path / f"{every}.jsonl", **given) as one:
             rig = Rig(substeps=20)
             for _ in range(200):
@@ -183,16 +181,15 @@ def test_with_a_deadline_no_fit_is_waited_for(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_fit_that_fails_is_said_and_the_next_one_begins(caplog: pytest.LogCaptureFixture) -> None:
     """And the process that fits ends with the exploration."""
-    learner = {"name": "simulation_error", "first_rows": 60, "growth": 1.0}
-    with caplog.at_level(logging.WARNING, logger="dopt"), explorer(learner=learner) as one:
+    with caplog.at_level(logging.WARNING, logger="dopt"), explorer() as one:
         rig, fits = late_rig(), one._fits
         assert fits is not None
         fits._thread.submit(int).result()  # until the first request is answered
         process = fits._process
         assert process is not None
-        drive(one, rig, 60)
+        drive(one, rig, 150)
         process.kill()
-        drive(one, rig, 200)
+        drive(one, rig, 90)
         assert one.counts["refits"] >= 1
     assert "its process has ended" in caplog.text
     for ended in (process, fits._process):

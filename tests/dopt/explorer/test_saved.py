@@ -118,35 +118,35 @@ def test_another_run_of_these_arguments_stays_apart(
     with explorer() as other:
         other.ask([0.3, 0.0])
         other.tell([0.3, 0.1])
-        other.save(f"sqlite:///{tmp_path}/other.db")
         with pytest.raises(StoreError, match=r"holds another exploration .* \(40 steps\).*seed"):
             other.save(url)
-    assert len(merge(url, f"sqlite:///{tmp_path}/other.db").conflicts) == 1
-    assert content(url) == before
+        other.save(f"sqlite:///{tmp_path}/other.db")
     with Reader.open(url) as reader:
         assert len(reader.launches()) == 1
+    assert len(merge(url, f"sqlite:///{tmp_path}/other.db").conflicts) == 1
+    assert content(url) == before
 
 
 def test_the_pages_show_it_live(url: str, run: Explorer) -> None:
     run.save(url)
     key = content(url)["trial_key"]
-    client = TestClient(create_app(url), base_url="http://127.0.0.1:8000")
-    for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
-        assert client.get(page).status_code == 200, page
-    assert "prequential loss" in client.get("/").text
-    assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text
-    arrays = client.get(f"/api/trials/{key}/arrays").json()
-    assert arrays["loss"] == run.errors.tolist()
-    assert arrays["is_prequential"] is True
-    assert arrays["phase"]["labels"] == ["angle [rad]", "rate [rad/s]"]
-    token = client.get("/api/grid").json()["progress"]["token"]
-    assert len(client.get("/api/curves?env=plant").json()["x"]) == 40
-    drive(run, 10)
-    run.save(url)
-    assert client.get("/api/grid").json()["progress"]["token"] != token
-    assert len(client.get("/api/curves?env=plant").json()["x"]) == 50
-    run.close()
-    assert "done, 50 of 300 steps" in client.get(f"/trials/{key}").text
+    with TestClient(create_app(url), base_url="http://127.0.0.1:8000") as client:
+        for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
+            assert client.get(page).status_code == 200, page
+        assert "prequential loss" in client.get("/").text
+        assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text
+        arrays = client.get(f"/api/trials/{key}/arrays").json()
+        assert arrays["loss"] == run.errors.tolist()
+        assert arrays["is_prequential"] is True
+        assert arrays["phase"]["labels"] == ["angle [rad]", "rate [rad/s]"]
+        token = client.get("/api/grid").json()["progress"]["token"]
+        assert len(client.get("/api/curves?env=plant").json()["x"]) == 40
+        drive(run, 10)
+        run.save(url)
+        assert client.get("/api/grid").json()["progress"]["token"] != token
+        assert len(client.get("/api/curves?env=plant").json()["x"]) == 50
+        run.close()
+        assert "done, 50 of 300 steps" in client.get(f"/trials/{key}").text
 
 
 def test_a_frame_of_runs_of_unequal_length(sqlite_url: str, run: Explorer) -> None:
