@@ -49,11 +49,11 @@ def drive(one: Explorer, rig: Rig, steps: int) -> None:
 def test_the_plant_is_found_beside_the_rig() -> None:
     rig = late_rig()
     with explorer() as one:
-        drive(one, rig, 400)
+        drive(one, rig, 300)
         assert one.counts["refits"] >= 3
         assert one.constants["gain"] == pytest.approx(5.0, rel=0.05)
         assert one.constants["delay"] + one.constants["lag"] == pytest.approx(0.06, abs=0.006)
-        at = one.states[:400]
+        at = one.states[:300]
         missed = one.predict(at)[:, 0] - np.array([motor_acceleration(x) for x in at])
         assert np.median(np.abs(missed)) < 0.5
 

@@ -169,7 +169,7 @@ def learned(case: str, units: Units, steps: int) -> Learned:
 def test_powers_of_two_change_no_bit(case: str) -> None:
     """Other factors change the rounding alone. A fit to simulations is made in 310 steps."""
     fitted = case == "simulation_error"
-    steps = 310 if fitted else 150
+    steps = 310 if fitted else 100
     expected = learned(case, Units(), steps)
     assert (expected.refits > 0) == fitted
     for units in (Units(1024.0, 0.125), Units(0.125, 1024.0))[fitted:]:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from numba.core.errors import TypingError
 
 from dopt.evaluation import evaluation_set
 from dopt.kernel import cache, run
@@ -141,6 +142,16 @@ def test_a_pointer_reads_and_writes_what_the_structures_hold() -> None:
     function(fast.held, out)
     assert out.tolist() == [plant.dt, plant.n_inputs, 0.25, 2.0, 1.0, 0.0, theta[1:3].sum()]
     assert fast.state.covariance.n_pending[0] == 7
+
+
+def test_a_field_that_does_not_exist_is_refused_by_name() -> None:
+    fast = KernelTrial(TrialSpec.from_names("pendulum", "d_optimal"))
+
+    def wrong(held: HeldTrial) -> float:
+        return float(trial_in(held).plant.mass)
+
+    with pytest.raises(TypingError, match=r"Unknown attribute 'mass' of type pointer\(Plant"):
+        kept(wrong).compile((held_kind(fast.trial),))  # type: ignore[attr-defined]
 
 
 def test_a_pointer_s_type_is_that_of_its_structure() -> None:
