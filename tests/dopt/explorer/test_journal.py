@@ -560,7 +560,7 @@ def test_a_question_during_a_late_plan_does_not_wait() -> None:
         with slow_plans(explorer):
             for _ in range(2):
                 assert np.array_equal(explorer.ask(x), [0.25, -0.25])
-                assert explorer._planner.is_late
+                assert not explorer._planner._late.done()
         assert explorer.tell(steered(x, np.array([0.25, -0.25])))
         assert explorer.counts["missed"] == 1
         assert explorer.inputs[1].tolist() == [0.25, -0.25]
