@@ -104,8 +104,10 @@ def _(system: Car, states: Array) -> Body:
 @body.register(Arm)
 @body.register(Chain)
 def _(system: Arm | Chain, states: Array) -> Body:
-    many = isinstance(system, Chain)
-    lengths = [system.length] * system.n_learned if many else [system.length_1, system.length_2]
+    if isinstance(system, Chain):
+        lengths = [system.length] * system.n_learned
+    else:
+        lengths = [system.length_1, system.length_2]
     pairs = zip(system.angle_indices, lengths, strict=True)
     masses = np.cumsum([_hanging(states[:, i], length) for i, length in pairs], axis=0)
     return Body((_polyline(0 * masses[0], *masses),), _polyline(*masses))

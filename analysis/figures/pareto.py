@@ -109,7 +109,11 @@ def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -
     for entry, learner in zip(selection.entries, learners, strict=True):
         scores = final_losses(reader, entry, "loss", rule)
         system, loss = system_of(entry.config.config), geometric_mean(scores.values)
-        row = {"env": entry.config.env, "label": entry.label, "policy": entry.config.policy}
+        row: dict[str, Any] = {
+            "env": entry.config.env,
+            "label": entry.label,
+            "policy": entry.config.policy,
+        }
         row |= {"policy_label": policies[section_text(entry, "policy")], "learner_label": learner}
         row |= {"us_per_step": step_us(reader, entry)}
         row |= {"loss": loss.value, "low": loss.low, "high": loss.high, "unit": loss_unit(system)}
@@ -117,9 +121,11 @@ def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -
         rows.append(row | {"counts": scores.describe(), "limit_us": 1e6 * system.dt})
     table = pd.DataFrame(rows)
     costs = table[["us_per_step", "loss"]]
-    table["on_front"] = False
-    for _, part in costs.groupby(table["env"]):
-        table.loc[part.index, "on_front"] = on_front(part.to_numpy())
+    front = np.zeros(len(table), dtype=bool)
+    for env in selection.environments:
+        own = (table["env"] == env).to_numpy()
+        front[own] = on_front(costs.to_numpy()[own])
+    table["on_front"] = front
     table["known"] = np.isfinite(costs).all(axis=1)
     place = table["env"].map(selection.environments.index)
     order = np.lexsort((table["us_per_step"], ~table["known"], place))
@@ -217,7 +223,7 @@ def _panel(
 ) -> None:
     known = points[points["known"]]
     for point in known.itertuples():
-        _dot(axes, point, colours[point.policy_label], markers[point.learner_label])
+        _dot(axes, point, colours[str(point.policy_label)], markers[str(point.learner_label)])
     _limits(axes, known)
     front = known[known["on_front"]]
     if len(front):  # as steps

@@ -367,7 +367,8 @@ def draw_spectra(spectra: InputSpectra) -> Figure:
     for name, rows in reversed(found.items()):
         _line(axes, name, rows)
     log_scale(axes, *_spectrum_limits(pd.concat(found.values())))
-    log_scale(axes, *next(iter(found.values()))["frequency_hz"].iloc[[0, -1]], "x")
+    frequency = next(iter(found.values()))["frequency_hz"]
+    log_scale(axes, frequency.iloc[0], frequency.iloc[-1], "x")
     axes.set_xlabel("frequency [Hz]")
     unit = f"({spectra.unit})" if " " in spectra.unit else spectra.unit
     axes.set_ylabel(f"power spectral density of u [{unit}²/Hz]")
