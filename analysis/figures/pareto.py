@@ -126,7 +126,7 @@ def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -
         own = (table["env"] == env).to_numpy()
         front[own] = on_front(costs.to_numpy()[own])
     table["on_front"] = front
-    table["known"] = np.isfinite(costs).all(axis=1)
+    table["known"] = np.isfinite(costs.to_numpy(float)).all(axis=1)
     place = table["env"].map(selection.environments.index)
     order = np.lexsort((table["us_per_step"], ~table["known"], place))
     return table.iloc[order].reset_index(drop=True)
