@@ -8,6 +8,8 @@ with e_k the residuals of window k in standard deviations, ρ(r) = c log(1 + r/c
 (windows that nothing fits count little), p in standard deviations of its prior, and s the factor
 by which the residuals count as larger than their deviations say: they are smooth curves, so that
 few of those in a window are independent. A step is taken by the method of Levenberg and Marquardt.
+It eliminates the initial states, whose steps are not damped: where they lead too far, a window that
+fits worse than before takes a damped one, so that it holds up no other.
 
 Predictions of parts of a log are at the end, with a linear model for comparison.
 """
@@ -288,13 +290,20 @@ def solve(
             trial = p + step
             moved = windows._replace(starts=_moved(windows.starts, linear, step))
             after = simulator.squares(trial, moved)
+            if not cost(after, trial) < value:
+                damped = _moved(windows.starts, linear, step, 1.0 / (1.0 + damping))
+                others = simulator.squares(trial, windows._replace(starts=damped))
+                held = (after > squares) & (others < after)
+                moved = windows._replace(starts=np.where(held[:, None], damped, moved.starts))
+                after = np.where(held, others, after)
             new = cost(after, trial)
             if new < value:
                 break
             damping *= growth
             growth *= 2.0
         if not new < value:
-            converged = True
+            foreseen = b @ np.linalg.solve(H, b) + np.sum(linear.g**2)
+            converged = bool(foreseen < tolerance * value)
             break
         fall, foreseen = value - new, float(step @ (b + damping * step))
         ratio = fall / foreseen if foreseen > 0.0 else 1.0
@@ -307,9 +316,9 @@ def solve(
     return Solution(p, windows, squares, scale, steps, converged)
 
 
-def _moved(starts: Array, linear: Linear, step: Array) -> Array:
-    """Return the initial states after a step of the parameters."""
-    right = linear.g - linear.C @ step
+def _moved(starts: Array, linear: Linear, step: Array, share: float = 1.0) -> Array:
+    """Return the initial states after a step of the parameters, and a share of their own step."""
+    right = share * linear.g - linear.C @ step
     d = starts.shape[1]
     delta = np.zeros_like(starts)
     for i in range(d - 1, -1, -1):  # back substitution, a column without a pivot stays
