@@ -265,6 +265,9 @@ def test_what_it_cannot_fit_is_refused() -> None:
         explorer(model="mlp")
     with pytest.raises(IncompatibleError, match="but model 'affine' was given"):
         explorer(model={"name": "affine", "depth": 1})
+    grey = {"model": {"name": "grey_box", "unknown": ["gain"]}, "learner": "ekf"}
+    with pytest.raises(IncompatibleError, match=r"learner 'simulation_error' estimates the const"):
+        explorer(**grey)
     with pytest.raises(IncompatibleError, match="kernel alone"):
         explorer(path="reference")
     with pytest.raises(SpecificationError, match="growth"):
