@@ -289,9 +289,11 @@ def solve(
             step = cho_solve(factor, b, check_finite=False)
             trial = p + step
             moved = windows._replace(starts=_moved(windows.starts, linear, step))
-            after = simulator.squares(trial, moved)
+            after, held = simulator.squares(trial, moved), np.zeros(1, bool)
             if not cost(after, trial) < value:
-                damped = _moved(windows.starts, linear, step, 1.0 / (1.0 + damping))
+                size = max(np.trace(H) / max(model.q, 1), 1.0)
+                share = size / (size + damping)  # about as p is damped
+                damped = _moved(windows.starts, linear, step, share)
                 others = simulator.squares(trial, windows._replace(starts=damped))
                 held = (after > squares) & (others < after)
                 moved = windows._replace(starts=np.where(held[:, None], damped, moved.starts))
@@ -311,7 +313,7 @@ def solve(
         p, windows, squares = trial, moved, after
         if say:
             say(f"  step {steps}: cost {new:.6g}, fall {fall / value:.1e}, damping {damping:.0e}")
-        calm = calm + 1 if fall < tolerance * value else 0
+        calm = calm + 1 if fall < tolerance * value and not held.any() else 0
         value, converged = new, calm >= 2
     return Solution(p, windows, squares, scale, steps, converged)
 
