@@ -25,10 +25,10 @@ unexport PYTHONDONTWRITEBYTECODE
 # tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
 ALL := --numprocesses 3 --dist loadgroup --no-loadscope-reorder --ignore=tests/studies -m 'not soak and not machines and not image'
 # Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
-# no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
+# no cluster and no browser. One file compiles, and is left to `make test`.
 FAST := tests/test_architecture.py tests/test_release.py tests/dopt/test_fields.py tests/dopt/test_sphere.py \
 	tests/dopt/test_spec.py tests/dopt/test_checks.py tests/dopt/test_control.py tests/dopt/systems tests/analysis/test_statistics.py tests/orchestrate/config \
-	--ignore=tests/dopt/systems/test_each.py --ignore=tests/orchestrate/config/test_several_grids.py
+	--ignore=tests/dopt/systems/test_each.py
 .PHONY: help setup run test test-fast test-studies test-lowest test-machines soak image coverage lint format docs \
 	grid figures study claims smoke bench bench-check clean
 

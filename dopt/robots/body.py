@@ -204,7 +204,7 @@ class Body:
                 axis = turn @ model.jnt_axis[j]
                 anchor = origin + turn @ model.jnt_pos[j]
                 moved = motion.positions[:, k] - model.qpos0[self.addresses[k]]
-                if model.jnt_type[j] == _HINGE:
+                if model.jnt_type[j] == HINGE:
                     column = np.concatenate([axis, _cross(anchor, axis)], axis=1)
                     turn = turn @ _turns(model.jnt_axis[j], moved)
                     origin = anchor - turn @ model.jnt_pos[j]
@@ -330,7 +330,7 @@ class Contacts:
         return result
 
 
-_HINGE, _SLIDE = 3, 2
+HINGE, SLIDE = 3, 2
 """Types of joints of MuJoCo."""
 
 
@@ -411,7 +411,7 @@ def rotation(quaternion: Array) -> Array:
 
 
 def _driven_joints(model: mujoco.MjModel) -> list[int]:
-    free = [j for j in range(model.njnt) if model.jnt_type[j] in (_HINGE, _SLIDE)]
+    free = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
     if not model.nu:
         return free
     by_joint = {int(model.actuator_trnid[a, 0]) for a in range(model.nu) if _of_joint(model, a)}
@@ -434,9 +434,9 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
     held = model.njnt - len(ids)
     left = {
-        f"{held} joints that no actuator drives stay where the file puts them": held,
-        f"{model.ntendon} tendons are left out": model.ntendon,
-        f"{model.neq} equality constraints are left out": model.neq,
+        f"joints without an actuator, which stay where the file puts them: {held}": held,
+        f"tendons that are left out: {model.ntendon}": model.ntendon,
+        f"equality constraints that are left out: {model.neq}": model.neq,
     }
     return [text for text, count in left.items() if count]
 

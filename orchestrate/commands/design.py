@@ -151,7 +151,8 @@ def _told(problem: Problem, motion: Motion, errors: np.ndarray) -> dict[str, Any
 
 
 def _said(document: dict[str, Any]) -> list[str]:
-    lines = [f"{document['robot']}: {len(document['joints'])} joints"]
+    count = len(document["joints"])
+    lines = [f"{document['robot']}: {count} joint{'s' if count > 1 else ''}"]
     lines += [f"note: {note}" for note in document["notes"]]
     lines += _listed(document["null"], "combinations that no motion can tell")
     lines += _listed(document["weak"], "parameters with standard errors above 100 %")

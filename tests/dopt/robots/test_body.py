@@ -106,7 +106,7 @@ def test_torques_are_those_of_the_engine(arm: Body) -> None:
 def test_a_free_body_is_no_joint_and_a_note_says_so(arm: Body) -> None:
     assert arm.joints == ("turn", "slide", "lift", "roll")
     assert arm.bodies == ("base", "link", "hand")
-    assert "1 joints that no actuator drives stay where the file puts them" in arm.notes
+    assert "joints without an actuator, which stay where the file puts them: 1" in arm.notes
 
 
 @pytest.mark.parametrize("name", ["mass", "com", "inertia", "armature", "damping"])
@@ -248,13 +248,32 @@ def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
         ("joints: {lift: 3}", "lift in .* is 3, but a mapping"),
         ("[1, 2]", "has no mapping 'joints'"),
         ("joints: {lift: [", "cannot be read"),
-        ("joints: {lift: {velocity: 2}}", "joint 'turn' has no limit of its velocity"),
+        ("joints: {lift: {velocity: 2}}", "velocity of turn"),
     ],
 )
 def test_limits_that_are_wrong_are_named(arm: Body, tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "limits.yaml").write_text(text)
     with pytest.raises(SpecificationError, match=said):
         Limits.of(arm, tmp_path / "limits.yaml")
+
+
+def test_missing_limits_are_named_at_once_with_the_lines_to_fill_in(arm: Body) -> None:
+    with pytest.raises(SpecificationError, match="velocity of turn and 3 more joints") as error:
+        Limits.of(arm)
+    lines = str(error.value).partition("\n")[2]
+    assert lines == "joints:\n  default: {velocity: …}"
+    arm.model.jnt_limited[arm.model.joint("slide").id] = 0
+    with pytest.raises(SpecificationError, match="position of slide; velocity of turn") as error:
+        Limits.of(arm)
+    lines = str(error.value).partition("\n")[2]
+    assert lines == "joints:\n  default: {velocity: …}\n  slide: {position: […, …]}"
+
+
+def test_a_slide_has_units_of_its_own(arm: Body, limits: Limits) -> None:
+    found = {one.name: one.unit for one in Unknowns(arm, limits, "all").parameters}
+    assert found["damping:slide"] == "N s/m" != found["damping:lift"] == "N m s/rad"
+    assert [found[f"{kind}:slide"] for kind in ("armature", "frictionloss")] == ["kg", "N"]
+    assert found["gear:slide"] == ""
 
 
 @pytest.mark.parametrize(
