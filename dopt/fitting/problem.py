@@ -44,7 +44,7 @@ FIRST_DAMPING = 1.0
 LEAST_DAMPING = 1e-6
 
 LARGEST_DAMPING = 1e12
-"""Damping at which no step is short enough: a minimum up to rounding."""
+"""Damping at which no step is short enough: a minimum up to rounding if little is foreseen."""
 
 STUCK = 1e12
 """What a window that leaves the limit counts for, by c."""
