@@ -17,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -141,8 +142,8 @@ def fit(
     chosen = physics
     if width and (found := work.choose_network(width, weights, seed)) is not None:
         chosen = work.finish(*found)
-    selection = Selection(tuple(work.table), work.window, dict(work.scan), tuple(work.notes))
-    return Fitted(plant, hold, work.data, chosen, physics, work.held_out(), selection, tests)
+    held_out = work.held_out()
+    return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
 
 
 class _Selection:
@@ -156,6 +157,7 @@ class _Selection:
         workers: int,
         say: Callable[[str], None],
     ) -> None:
+        self._began = time.perf_counter()
         self.plant, self.data, self.blocks, self.say = plant, data, blocks, say
         self.workers, self._all_blocks = workers, blocks
         self.delay = first_guess(plant.delay)
@@ -176,6 +178,11 @@ class _Selection:
             free_delay=free and isinstance(self.plant.delay, Unknown),
             free_lag=isinstance(self.plant.lag, Unknown),
         )
+
+    def selection(self, seed: int) -> Selection:
+        seconds = time.perf_counter() - self._began
+        told = tuple(self.table), self.window, dict(self.scan), tuple(self.notes)
+        return Selection(*told, seed, seconds)
 
     def lengths(self, window: float | None) -> list[float]:
         """Return the lengths of windows that are tried [s], the shortest first."""

@@ -48,12 +48,14 @@ class Estimate(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """What validation over blocks has compared: losses with standard errors, and notes."""
+    """What validation over blocks has compared: losses with standard errors, and notes; and how."""
 
     table: tuple[tuple[str, float, float], ...]
     window: float  # length that was chosen [s]
     delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
+    seed: int  # of the network that was tried
+    seconds: float  # wall time of the fit [s]
 
 
 class Simulation(NamedTuple):

@@ -263,6 +263,12 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
 
 def _check_unknown(system: System, model: GreyBox) -> None:
     """Check that a grey box has unknown parameters, each of the system's and with one guess."""
+    if isinstance(system, ExploredPlant):  # whose accelerations are NaN
+        expected = (
+            "accelerations that are equations (of a plant, learner 'simulation_error' estimates "
+            "the constants that are dopt.unknown())"
+        )
+        raise mismatch("model 'grey_box'", expected, f"env '{system.name}'")
     names = model.names(system)
     if not names or len(set(names)) < len(names) or not set(names) <= set(system.physical):
         expected = f"names out of {', '.join(system.physical) or 'none'}, none of them twice"

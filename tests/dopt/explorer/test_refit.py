@@ -202,6 +202,10 @@ def test_what_it_cannot_fit_is_refused() -> None:
     given: tuple[tuple[dict[str, Any], str], ...] = (
         ({"model": "mlp"}, r"goes with model.depth 1, but model.depth 2"),
         ({"model": {"name": "affine", "depth": 1}}, "but model 'affine' was given"),
+        (
+            {"model": {"name": "grey_box", "unknown": ["gain"]}, "learner": "ekf"},
+            r"learner 'simulation_error' estimates the const",
+        ),
         ({"path": "reference"}, "kernel alone"),
         ({"learner": {"name": "simulation_error", "growth": -1.0}}, "growth"),
     )

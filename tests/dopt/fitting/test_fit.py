@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 import dopt
 from dopt.errors import SpecificationError
+from dopt.fitting import problem
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import Simulator, Windows, first_states, solve, windows_of
@@ -147,6 +148,56 @@ def test_elimination_gives_the_step_of_the_whole_problem() -> None:
         right.append(np.sqrt(weights[k]) * error)
     whole = np.linalg.lstsq(np.concatenate(blocks), np.concatenate(right), rcond=None)[0]
     np.testing.assert_allclose(np.linalg.solve(linear.normal, linear.slope), whole[:q], rtol=1e-8)
+
+
+def badly_begun(seed: int) -> tuple[Simulator, Windows, float]:
+    """Return a noisy run with drag, windows of up to four seconds, and starts far from it."""
+    rng = np.random.default_rng(seed)
+    table = run(seed, 600, drag=rng.uniform(0, 0.6))
+    table["angle"] += 0.01 * rng.standard_normal(len(table))
+    guesses = [value * np.exp(rng.normal()) for value in TRUE[:3]]
+    constants = {
+        **dict(zip(("gain", "damping", "gravity"), map(dopt.unknown, guesses), strict=True)),
+        "offset": dopt.unknown(0.0, spread=0.2),
+    }
+    plant = declared(measured={"angle": 0.01}, delay=0.02, constants=constants)
+    data = data_of(plant, [dopt.Log.for_plant(table, plant)], "zero")
+    model = Model(plant, delay=0.02)
+    rows = windows_of(data, 0, 599, float(rng.choice([0.4, 0.8, 2.0, 4.0])), skip=0.1, ahead=0.05)
+    starts = first_states(data, model, rows)
+    starts += rng.normal(size=starts.shape) * [0.3, 2.0]
+    return Simulator(model, data), Windows(rows, starts), float(rng.choice([1.0, 3.0]))
+
+
+def cost(sim: Simulator, found: problem.Solution, s: float) -> float:
+    prior = np.sum((found.p - sim.model.prior) ** 2)
+    return float(problem.robust(found.squares, found.scale).sum() / s**2 + prior)
+
+
+def test_what_has_converged_gains_nothing_from_another_beginning() -> None:
+    """A window whose start steps too far holds up no other: five of these fits were stuck."""
+    for seed in range(40):
+        sim, windows, s = badly_begun(seed)
+        found = solve(sim, windows, sim.model.prior, s)
+        settled = sim.settled(found.p, found.windows)
+        again = solve(sim, settled, found.p, s, scale=found.scale)
+        assert found.converged or found.steps == 30, "it still falls where its steps end"
+        assert not found.converged or cost(sim, again, s) > 0.98 * cost(sim, found, s), seed
+
+
+def test_a_fit_that_may_not_step_converges_at_a_minimum_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sim, windows, s = badly_begun(0)
+    found = solve(sim, windows, sim.model.prior, s, tolerance=1e-9)
+    monkeypatch.setattr(problem, "LARGEST_DAMPING", problem.FIRST_DAMPING)
+    stuck = solve(sim, windows, sim.model.prior, s)
+    assert (stuck.steps, stuck.converged) == (1, False)
+    again = solve(sim, found.windows, found.p, s, scale=found.scale)
+    assert (again.steps, again.converged) == (1, True)
+    starts = found.windows.starts + 0.01
+    moved = solve(sim, found.windows._replace(starts=starts), found.p, s, scale=found.scale)
+    assert not moved.converged, "its starts could fall"
 
 
 def test_an_input_that_was_measured_is_interpolated() -> None:

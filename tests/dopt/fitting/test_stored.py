@@ -65,7 +65,7 @@ def test_numbers_states_and_declaration_are_stored(url: str, found: Fitted) -> N
     assert (trial.trial_key, trial.status, trial.policy) == (key, "done", "recorded")
     assert (trial.model, trial.learner, trial.width) == ("constants", "simulation_error", None)
     assert trial.dt == pytest.approx(0.02)
-    assert trial.wall_seconds is None
+    assert trial.wall_seconds == found.selection.seconds > 0.0
     for name, (value, error) in found.constants.items():
         assert values[n, f"constant.{name}"] == pytest.approx(value, rel=1e-12)
         assert values[n, f"error.{name}"] == pytest.approx(error, rel=1e-12)
@@ -105,6 +105,15 @@ def test_a_fit_has_one_row_and_another_its_own(
     assert not examine(url, trial_key)
     with pytest.raises(StoreError, match=r"write it as sqlite:///results\.db"):
         found.store("results.db")
+
+
+def test_a_fit_with_a_network_has_its_seed_and_one_without_has_none(url: str) -> None:
+    dragged, how = run(0, ROWS, drag=0.4), {"window": 0.3, "weights": (10.0,)}
+    for seed, width in ((5, 4), (6, 4), (7, 0)):
+        found = dopt.fit(declared(), dragged, width=width, seed=seed, **how)  # type: ignore[arg-type]  # of several types
+        assert found.has_network == bool(width)
+        found.store(url)
+    assert sorted(rows(url, "SELECT seed FROM trial")) == [(0,), (5,), (6,)]
 
 
 def test_pages_commands_and_merges_know_it(
