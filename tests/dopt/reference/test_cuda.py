@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(
 
 OWN = {
     "network": {"_target_": "tests.dopt.custom_networks.Stack"},
-    "residual": {"_target_": "tests.dopt.reference.test_batch.Residual"},
+    "residual": {"_target_": "tests.dopt.reference.test_reference.Residual"},
 }
 CASES: dict[str, TrialSpec] = {
     **{
