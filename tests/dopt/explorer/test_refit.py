@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -94,6 +98,36 @@ def test_a_network_is_fitted_beside_while_samples_are_filtered(tmp_path: Path) -
             assert again.counts["refits"] == before[0]
             np.testing.assert_array_equal(again.parameters, before[1])
     assert missed[0] < 0.7 * missed[400]
+
+
+KILLED = """
+import sys
+from tests.dopt.explorer.test_refit import drive, explorer, late_rig
+with explorer(journal=sys.argv[1], fsync=False) as one:
+    rig = late_rig()
+    while True:
+        drive(one, rig, 1)
+        print(one.n_steps, one.counts["refits"], one.parameters.tobytes().hex(), flush=True)
+"""
+
+
+@pytest.mark.parametrize("refits", [0, 2])
+def test_what_a_killed_process_had_learned_is_there_again(tmp_path: Path, refits: int) -> None:
+    path = tmp_path / "run.jsonl"
+    code = [sys.executable, "-c", KILLED, str(path)]
+    with subprocess.Popen(code, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        for line in process.stdout:
+            steps, count, parameters = line.split()
+            if int(count) >= refits and int(steps) >= 160:  # a fit is running
+                os.kill(process.pid, signal.SIGKILL)
+                break
+        rest = process.stdout.read().splitlines()
+    steps, count, parameters = rest[-1].split() if rest else (steps, count, parameters)
+    with explorer(journal=path) as again:
+        told = (again.n_steps, again.counts["refits"], again.parameters.tobytes().hex())
+        assert told[0] >= int(steps)
+        assert told[:2] != (int(steps), int(count)) or told[2] == parameters
 
 
 def test_a_network_in_scaled_numbers_is_the_network_of_the_fit() -> None:

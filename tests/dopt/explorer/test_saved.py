@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -383,6 +384,26 @@ def test_a_save_that_fails_in_the_middle_leaves_what_was_stored(
     assert run.save(url)
     assert content(url)["n_steps"] == 80
     assert not examine(url, trial_key)
+
+
+def test_a_locked_database_is_said_and_the_exploration_goes_on(
+    sqlite_url: str, monkeypatch: pytest.MonkeyPatch, run: Explorer
+) -> None:
+    opening = partial(Store.open, patience=0.05)
+    monkeypatch.setattr("orchestrate.runner.saving.Store.open", opening)
+    run.save(sqlite_url)
+    before = content(sqlite_url)
+    other = sqlite3.connect(sqlite_url.removeprefix("sqlite:///"), isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    drive(run, 10)
+    with pytest.raises(StoreUnavailableError, match=r"has locked it for more than 0.05 s"):
+        run.save(sqlite_url)
+    assert content(sqlite_url) == before
+    drive(run, 10)
+    other.execute("ROLLBACK")
+    other.close()
+    assert run.save(sqlite_url)
+    assert content(sqlite_url)["n_steps"] == 60
 
 
 def test_without_orchestrate_that_is_said(run: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:
