@@ -25,10 +25,10 @@ unexport PYTHONDONTWRITEBYTECODE
 # tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
 ALL := --numprocesses 3 --dist loadgroup --no-loadscope-reorder --ignore=tests/studies -m 'not soak and not machines and not image'
 # Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
-# no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
+# no cluster and no browser. One file compiles, and is left to `make test`.
 FAST := tests/test_architecture.py tests/test_release.py tests/dopt/test_fields.py tests/dopt/test_sphere.py \
 	tests/dopt/test_spec.py tests/dopt/test_checks.py tests/dopt/test_control.py tests/dopt/systems tests/analysis/test_statistics.py tests/orchestrate/config \
-	--ignore=tests/dopt/systems/test_each.py --ignore=tests/orchestrate/config/test_several_grids.py
+	--ignore=tests/dopt/systems/test_each.py
 .PHONY: help setup run test test-fast test-studies test-lowest test-machines soak image coverage lint format docs \
 	grid figures study claims smoke bench bench-check clean
 
@@ -80,10 +80,10 @@ coverage: setup  ## run the test suite and require that 90 % of the lines are ru
 
 test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
-	$(BIN)/python -m pytest --numprocesses 2 -m machines tests/machines
+	$(BIN)/python -m pytest --numprocesses 3 -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
-	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} $(BIN)/python -m pytest -m soak tests/soak
+	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} $(BIN)/python -m pytest --numprocesses 3 -m soak tests/soak
 
 image: setup  ## build the image and run its services (root on Debian)
 	.ci/image

@@ -7,6 +7,7 @@ missing and ``--allow-partial`` was not given; 130: interrupted.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import socket
 import sys
@@ -39,7 +40,7 @@ from analysis.tables.rendering import (
 from dopt.errors import install_command
 from dopt.process import usable_cores
 from dopt.result import Assessment
-from orchestrate.program import Parser, UsageError, answered, path, positive, tell
+from orchestrate.program import Parser, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, Store, default_url
 
 COLUMNS = ("loss", "reachable_loss")
@@ -64,7 +65,8 @@ def _run(options: argparse.Namespace) -> int:
         return int(options.alone(options))
     with Reader.open(options.db) as reader:
         selection = select(reader, wanted(options))
-        _check_complete(selection, options.allow_partial)
+        if selection.gaps and not options.allow_partial:
+            raise incomplete(selection.gaps, "a complete grid is", "--env and --policy")
         for note in selection.notes:
             tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
         return int(options.run(reader, selection, options))
@@ -87,7 +89,10 @@ def parser() -> Parser:
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     cores = usable_cores()
     figures.add_argument(
-        "--workers", type=_workers, default=cores, help="outputs at a time (one for each core)"
+        "--workers",
+        type=positive("--workers", int),
+        default=cores,
+        help="outputs at a time (one for each core)",
     )
     summary = _command(commands, "summary", _table, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _table, "every variant against the reference, paired")
@@ -157,12 +162,6 @@ def parser() -> Parser:
     return top
 
 
-def _workers(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise UsageError(f"--workers is {text}, but at least 1 is expected: give a whole number.")
-    return int(text)
-
-
 def _command(
     commands: argparse._SubParsersAction[Parser],
     name: str,
@@ -206,42 +205,28 @@ def add_database(command: Parser) -> None:
 
 def wanted(options: argparse.Namespace) -> Filter:
     """Return the selection that the options of :func:`add_selection` ask for."""
-    where = dict(_condition(text) for text in options.where)
-    reference = getattr(options, "reference", REFERENCE)
-    group_by = tuple(getattr(options, "group_by", ("policy",)))
-    return Filter(tuple(options.env), tuple(options.policy), where, reference, group_by)
-
-
-def _condition(text: str) -> tuple[str, object]:
-    found = read_condition(text)
-    if found is None:
+    where = [read_condition(text) for text in options.where]
+    if None in where:
         raise AnalysisError(
-            f"--where {text} is no condition, PATH=VALUE is expected: "
+            f"--where {options.where[where.index(None)]} is no condition, PATH=VALUE is expected: "
             f"write for instance --where model.width=32."
         )
-    return found
-
-
-def _check_complete(selection: Selection, allow_partial: bool) -> None:
-    if selection.gaps and not allow_partial:
-        raise incomplete(selection.gaps, "a complete grid is", "--env and --policy")
+    reference = getattr(options, "reference", REFERENCE)
+    group_by = tuple(getattr(options, "group_by", ("policy",)))
+    conditions = dict(one for one in where if one)
+    return Filter(tuple(options.env), tuple(options.policy), conditions, reference, group_by)
 
 
 def _plot_options(options: argparse.Namespace) -> PlotOptions:
     """Return what a command was asked to show; options that it lacks are as usual."""
-    given = {
-        "rule": ("diverged", DivergenceRule),
-        "axis": ("x", Axis),
-        "statistic": ("statistic", Statistic),
-        "spread": ("style", Spread),
-        "epsilon": ("epsilon", None),
-        "color_by": ("color_by", None),
-    }
-    found: dict[str, Any] = {
-        field: kind(getattr(options, name)) if kind else getattr(options, name)
-        for field, (name, kind) in given.items()
-        if name in options
-    }
+    names = {"rule": "diverged", "axis": "x", "spread": "style"}
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(PlotOptions):
+        name = names.get(field.name, field.name)
+        if name in options:
+            kind: Any = type(field.default)
+            value = getattr(options, name)
+            found[field.name] = value if field.default is None else kind(value)
     return PlotOptions(**found)
 
 
@@ -324,7 +309,11 @@ def _add_serve(commands: argparse._SubParsersAction[Parser]) -> None:
 
 def _serve(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
-    _check_one_database(options)
+    if len(options.db) > 1:
+        raise AnalysisError(
+            f"A browser shows one database, but {len(options.db)} are given: start one for each, "
+            f"with --port 0, or put them together with orchestrate merge."
+        )
     try:
         from analysis.serve.app import Server, create_app
     except ModuleNotFoundError as error:
@@ -343,14 +332,6 @@ def _serve(options: argparse.Namespace) -> int:
     finally:
         listening.close()
     return 0
-
-
-def _check_one_database(options: argparse.Namespace) -> None:
-    if len(options.db) > 1:
-        raise AnalysisError(
-            f"A browser shows one database, but {len(options.db)} are given: start one for each, "
-            f"with --port 0, or put them together with orchestrate merge."
-        )
 
 
 def _listen(host: str, port: int) -> socket.socket:

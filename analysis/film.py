@@ -27,43 +27,23 @@ from analysis.data.selection import Entry
 from analysis.figures.loss_curves import loss_label
 from analysis.figures.panels import angle_ticks, log_ticks, mathematical, styled
 from analysis.stats.curves import DrawnPlane, log_limits
-from analysis.style import BLACK, GREY, environment_title, loss_unit, policy_style
+from analysis.style import BLACK, GREY, environment_title, loss_unit, policy_style, unit_of
 from dopt.run import rerun
-from dopt.systems import (
-    Arm,
-    Car,
-    Cartpole,
-    Chain,
-    CoupledPendulums,
-    Drone,
-    MassSpring,
-    MovingStar,
-    Pendulum,
-    Quadrotor,
-    System,
-    UnbalancedDisk,
-    VanDerPol,
-)
+from dopt.systems import Arm, Car, Cartpole, Chain, Quadrotor, System
 from orchestrate.files import whole
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
-
-CART = (0.3, 0.12)
-"""Half the length and half the height of the cart that is drawn, by the rod's length."""
+Move = Callable[[int, int], object]  # puts a panel into the state of a frame, at a step
 
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 """Corners of a square about the origin, from one back to it."""
 
-WHEEL = 0.4
-"""Half the length of a steered wheel that is drawn, by its distance from the centre of mass."""
+CART, WHEEL, BLOCK = (0.3, 0.12), 0.4, 0.3
+"""Half the sides of a cart, by its rod; half a wheel, by its axle; half the side of a block [m]."""
 
-BLOCK = 0.3
-"""Half the side of a mass between springs that is drawn [m]; at rest they are 2 m apart."""
-
-
-RIM = 1.2
-"""Radius of the disk that is drawn [m]; its weight is 1 m from the centre."""
+FOLLOW = 4.0
+"""Sizes of its body that a system travels before the view follows it."""
 
 
 @dataclass(frozen=True)
@@ -83,24 +63,24 @@ class Body:
 
 
 @singledispatch
-def body(system: System, states: Array) -> Body | None:  # noqa: ARG001  # its variants need them
-    """Return the body of a system at states (n, d); None for a system that has none."""
-    return None
+def body(system: System, states: Array) -> Body | None:
+    """Return the body of a system at states (n, d); None for one without angles and positions.
 
-
-@body.register
-def _(system: Pendulum, states: Array) -> Body:
-    tip = _hanging(states[:, 0], system.length)
-    return Body((_polyline(np.zeros_like(tip), tip),), tip[:, None])
-
-
-@body.register
-def _(system: UnbalancedDisk, states: Array) -> Body:  # noqa: ARG001  # its class decides
-    weight = _hanging(states[:, 0], 1.0)
-    turn = np.linspace(0.0, 2.0 * np.pi, 25)
-    rim = RIM * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    spoke = _polyline(np.zeros_like(weight), weight)
-    return Body((np.broadcast_to(rim, (len(states), *rim.shape)), spoke), weight[:, None])
+    Without a drawing of its own it has, 2 m apart, a rod for each angle and a block for each
+    position.
+    """
+    units = [unit_of(label) for label in system.state_labels]
+    shown = [i for i, unit in enumerate(units) if unit in ("rad", "m")]
+    lines, masses = [], []
+    for place, i in enumerate(shown):
+        rest = np.full((len(states), 2), [2.0 * place - (len(shown) - 1), 0.0])
+        if units[i] == "rad":
+            masses.append(rest + _hanging(states[:, i], getattr(system, "length", 1.0)))
+            lines.append(_polyline(rest, masses[-1]))
+        else:
+            masses.append(rest + np.pad(states[:, i : i + 1], ((0, 0), (0, 1))))
+            lines.append(masses[-1][:, None] + BLOCK * SQUARE)
+    return Body(tuple(lines), _polyline(*masses)) if shown else None
 
 
 @body.register
@@ -113,71 +93,30 @@ def _(system: Cartpole, states: Array) -> Body:
 
 @body.register
 def _(system: Car, states: Array) -> Body:
-    axis = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], axis=1)
+    axis, wheel = (_hanging(0.5 * np.pi + states[:, 2] + turn, 1.0) for turn in (0.0, states[:, 6]))
     front, rear = states[:, :2] + system.front * axis, states[:, :2] - system.rear * axis
-    heading = states[:, 2] + states[:, 6]
-    wheel = WHEEL * system.front * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    lines = _polyline(rear, front), _polyline(front - wheel, front + wheel)
-    return Body(lines, states[:, None, :2])
+    half = WHEEL * system.front * wheel
+    return Body(
+        (_polyline(rear, front), _polyline(front - half, front + half)), states[:, None, :2]
+    )
 
 
-@body.register
-def _(system: Arm, states: Array) -> Body:
-    elbow = _hanging(states[:, 0], system.length_1)
-    hand = elbow + _hanging(states[:, 2], system.length_2)
-    return Body((_polyline(np.zeros_like(elbow), elbow, hand),), np.stack([elbow, hand], axis=1))
-
-
-@body.register
-def _(system: Chain, states: Array) -> Body:
-    links = [_hanging(states[:, i], system.length) for i in system.angle_indices]
-    masses = np.cumsum(links, axis=0)
-    return Body((_polyline(np.zeros_like(masses[0]), *masses),), np.moveaxis(masses, 0, 1))
-
-
-@body.register
-def _(system: CoupledPendulums, states: Array) -> Body:
-    tips, pivots = [], []
-    for column, index in enumerate(system.angle_indices):
-        pivots.append(np.broadcast_to([2.0 * column, 0.0], (len(states), 2)))
-        tips.append(pivots[-1] + _hanging(states[:, index], 1.0))
-    rods = tuple(_polyline(pivot, tip) for pivot, tip in zip(pivots, tips, strict=True))
-    return Body(rods, np.stack(tips, axis=1))
-
-
-@body.register
-def _(system: MovingStar, states: Array) -> Body:
-    turn = np.linspace(0.0, 2.0 * np.pi, 49)
-    orbit = system.orbit * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return Body((np.broadcast_to(orbit, (len(states), *orbit.shape)),), states[:, None])
+@body.register(Arm)
+@body.register(Chain)
+def _(system: Arm | Chain, states: Array) -> Body:
+    if isinstance(system, Chain):
+        lengths = [system.length] * system.n_learned
+    else:
+        lengths = [system.length_1, system.length_2]
+    pairs = zip(system.angle_indices, lengths, strict=True)
+    masses = np.cumsum([_hanging(states[:, i], length) for i, length in pairs], axis=0)
+    return Body((_polyline(0 * masses[0], *masses),), _polyline(*masses))
 
 
 @body.register
 def _(system: Quadrotor, states: Array) -> Body:
-    centre, tilt = states[:, [0, 2]], states[:, 4]
-    arm = system.half_span * np.stack([np.cos(tilt), np.sin(tilt)], axis=1)
+    centre, arm = states[:, [0, 2]], _hanging(0.5 * np.pi + states[:, 4], system.half_span)
     return Body((_polyline(centre - arm, centre + arm),), centre[:, None])
-
-
-@body.register
-def _(system: VanDerPol, states: Array) -> Body:  # noqa: ARG001  # its class decides
-    mass = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
-    return Body((mass[:, None] + BLOCK * SQUARE,), mass[:, None])
-
-
-@body.register
-def _(system: Drone, states: Array) -> Body:
-    centre, turn = states[:, [0, 2]], np.linspace(0.0, 2.0 * np.pi, 25)
-    sphere = system.half_span * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return Body((centre[:, None] + sphere,), centre[:, None])
-
-
-@body.register
-def _(system: MassSpring, states: Array) -> Body:  # noqa: ARG001  # its class decides
-    level = np.zeros(len(states))
-    masses = [np.stack([rest + states[:, i], level], axis=1) for rest, i in ((-1, 0), (1, 2))]
-    corners = BLOCK * SQUARE
-    return Body(tuple(mass[:, None] + corners for mass in masses), np.stack(masses, axis=1))
 
 
 def _hanging(angle: Array, length: float) -> Array:
@@ -187,12 +126,6 @@ def _hanging(angle: Array, length: float) -> Array:
 
 def _polyline(*points: Array) -> Array:
     return np.stack(points, axis=1)
-
-
-Move = Callable[[int, int], object]  # puts a panel into the state of a frame, at a step
-
-FOLLOW = 4.0
-"""Sizes of its body that a system travels before the view follows it."""
 
 
 @dataclass(frozen=True)
@@ -224,12 +157,15 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
     if seed not in finished:
         raise AnalysisError(f"{name} is not finished: choose by --seed one of {finished[:10]}.")
     spec = simulated_trial(config, seed)
-    stored, curves = reader.trajectory(config.config_key, seed), reader.curves(config.config_key)
-    end = int(np.isfinite(stored.states).all(axis=1).sum()) - 1
+    states, curves = (
+        reader.trajectory(config.config_key, seed).states,
+        reader.curves(config.config_key),
+    )
+    states = states[np.isfinite(states).all(axis=1)]
+    end = len(states) - 1
     if end < 1:
         raise AnalysisError(f"{name} diverged at its first steps: choose another with --seed.")
     seen = rerun(spec, np.unique(np.linspace(0, end, frames).round().astype(int)).tolist())
-    states = stored.states[: end + 1]
     if not np.allclose(seen.states[: end + 1], states, rtol=1e-6, atol=1e-9):
         raise AnalysisError(
             f"{name} runs another way here than when it was stored, so what its model knew is not "
@@ -304,11 +240,11 @@ def _body(axes: Axes, story: Story) -> Move:
         centres[:], half = (low.min(axis=0) + high.max(axis=0)) / 2, 0.54 * reach
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(size))  # lines that pass by show the motion
-    lines = [axes.plot([], [], color=BLACK, lw=2.2)[0] for _ in drawn.lines]
-    masses = axes.plot([], [], "o", ms=6, color=story.colour)[0]
+    artists = [axes.plot([], [], color=BLACK, lw=2.2)[0] for _ in drawn.lines]
+    artists += axes.plot([], [], "o", ms=6, color=story.colour)
 
     def move(_: int, step: int) -> None:
-        for artist, line in zip((*lines, masses), (*drawn.lines, drawn.masses), strict=True):
+        for artist, line in zip(artists, (*drawn.lines, drawn.masses), strict=True):
             artist.set_data(*line[step].T)
         (x, y) = centres[step]
         axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half))

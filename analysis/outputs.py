@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures import wait as futures_wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -123,7 +123,7 @@ def build(
             else:
                 write(name)
                 yield Outcome(name, "written")
-    if write_page(folder, FIGURES, TABLES):
+    if write_page(folder, (*TABLES, *FIGURES)):
         yield Outcome(PAGE, "written")
 
 
@@ -197,11 +197,9 @@ def versions() -> dict[str, str | None]:
     """Return the versions of Python and the libraries; None where one is not installed."""
     found: dict[str, str | None] = {"python": platform.python_version(), "dopt": __version__}
     for library in LIBRARIES:
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             found[library] = importlib.metadata.version(library)
-        except importlib.metadata.PackageNotFoundError:
-            found[library] = None
-    return found
+    return dict.fromkeys(LIBRARIES) | found
 
 
 @functools.cache
@@ -267,10 +265,9 @@ def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
     }
 
 
-def write_page(folder: Path, pictures: Iterable[str], tables: Iterable[str]) -> bool:
+def write_page(folder: Path, names: Iterable[str]) -> bool:
     """Write the page of those outputs that the folder holds; False if it was the same already."""
-    sections = [_table(folder, name) for name in tables] + [_picture(folder, n) for n in pictures]
-    found = [section for section in sections if section]
+    found = [section for name in names if (section := _section(folder, name))]
     if not found:
         return False
     text = "\n\n".join(["# Figures and tables", _origin(folder), *found]) + "\n"
@@ -281,27 +278,23 @@ def write_page(folder: Path, pictures: Iterable[str], tables: Iterable[str]) -> 
     return True
 
 
-def _picture(folder: Path, name: str) -> str | None:
-    facts = _facts(folder, name)
-    if not facts or not (folder / f"{name}.png").is_file():
+def _section(folder: Path, name: str) -> str | None:
+    """Return the section of an output on the page, None for one that is not there."""
+    is_figure, facts = name in FIGURES, _facts(folder, name)
+    shown = folder / f"{name}.{'png' if is_figure else 'md'}"
+    if not facts or not shown.is_file():
         return None
-    caption = facts["caption"]
-    return (
-        f"## {facts['title']}\n\n![{facts['title']}]({name}.png)\n\n{caption}\n\n"
-        f"{_links(name, ('pdf', 'svg', 'csv', 'json'))}"
-    )
-
-
-def _table(folder: Path, name: str) -> str | None:
-    facts, path = _facts(folder, name), folder / f"{name}.md"
-    if not facts or not path.is_file():
-        return None
-    text = path.read_text(encoding="utf-8").rstrip()
-    return f"## {facts['title']}\n\n{text}\n\n{_links(name, ('csv', 'tex', 'json'))}"
-
-
-def _links(name: str, endings: tuple[str, ...]) -> str:
-    return " · ".join(f"[{name}.{ending}]({name}.{ending})" for ending in endings)
+    title = facts["title"]
+    endings: tuple[str, ...] = ("csv", "tex", "json")
+    if is_figure:
+        text, endings = (
+            f"![{title}]({shown.name})\n\n{facts['caption']}",
+            ("pdf", "svg", "csv", "json"),
+        )
+    else:
+        text = shown.read_text(encoding="utf-8").rstrip()
+    links = " · ".join(f"[{name}.{ending}]({name}.{ending})" for ending in endings)
+    return f"## {title}\n\n{text}\n\n{links}"
 
 
 def _origin(folder: Path) -> str:
@@ -361,12 +354,9 @@ def write_pictures(figure: Figure, folder: Path, name: str, title: str, mark: st
 def _metadata(ending: str, title: str, mark: str) -> dict[str, Any]:
     """Return metadata without a clock; with SOURCE_DATE_EPOCH set, matplotlib writes that date."""
     about = f"fingerprint {mark}, see the JSON file beside this one"
-    undated = "SOURCE_DATE_EPOCH" not in os.environ
-    if ending == "pdf":
-        return {"Title": title, "Subject": about} | ({"CreationDate": None} if undated else {})
-    if ending == "svg":
-        return {"Title": title, "Description": about} | ({"Date": None} if undated else {})
-    return {"Title": title, "Description": about}
+    clock = {"pdf": "CreationDate", "svg": "Date"}.get(ending)
+    undated = {clock: None} if clock and "SOURCE_DATE_EPOCH" not in os.environ else {}
+    return {"Title": title, "Subject" if ending == "pdf" else "Description": about, **undated}
 
 
 def write_table(table: pd.DataFrame, folder: Path, name: str) -> None:

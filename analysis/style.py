@@ -10,9 +10,8 @@ import math
 import re
 import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
 
 from dopt.policies import policy_title
 from dopt.systems import System
@@ -99,25 +98,6 @@ def sequence_style(place: int, same: int, label: str, colour: str | None = None)
 def environment_title(env: str) -> str:
     """Return the name of an environment as a title."""
     return env.replace("_", " ")
-
-
-class OfEnvironment(Protocol):
-    """Object that belongs to an environment."""
-
-    @property
-    def env(self) -> str: ...
-
-
-Item = TypeVar("Item", bound=OfEnvironment)
-
-
-def text_by_environment(items: Sequence[Item], describe: Callable[[Sequence[Item]], str]) -> str:
-    """Return the words for the items of each environment in turn, behind its title."""
-    texts = [
-        f"{environment_title(env)}: {describe([one for one in items if one.env == env])}"
-        for env in dict.fromkeys(one.env for one in items)
-    ]
-    return "; ".join(texts)
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -69,8 +69,7 @@ def wrap(angle: Array, centre: float = 0.0) -> Array:
 
 def turns(angle: Array, centre: float = 0.0) -> Array:
     """Return the number of whole turns between each angle and its wrapped value."""
-    count: Array = np.floor((angle - centre + math.pi) / TURN)
-    return count
+    return np.floor((angle - centre + math.pi) / TURN)
 
 
 @dataclass(frozen=True)
@@ -92,19 +91,14 @@ class Plane:
     @classmethod
     def of(cls, system: System) -> Self:
         """Return the phase plane of a system."""
-        axes = system.phase_plane
+        first, second = axes = system.phase_plane
         rest = system.equilibrium or (0.0,) * system.n_states
-        angles = (axes[0] in system.angle_indices, axes[1] in system.angle_indices)
-        centres = (
-            rest[axes[0]] if angles[0] else 0.0,
-            rest[axes[1]] if angles[1] else 0.0,
-        )
-        given = [_given_side(system, axis) for axis in axes]
-        sides = [
-            _side(side, centre) if turning else side
-            for side, centre, turning in zip(given, centres, angles, strict=True)
-        ]
-        labels = (system.state_labels[axes[0]], system.state_labels[axes[1]])
+        angles = first in system.angle_indices, second in system.angle_indices
+        centres = rest[first] if angles[0] else 0.0, rest[second] if angles[1] else 0.0
+        sides = [_given_side(system, axis) for axis in axes]
+        for i in np.flatnonzero(angles):
+            sides[i] = _side(sides[i], centres[i])
+        labels = system.state_labels[first], system.state_labels[second]
         return cls(axes, labels, angles, centres, (sides[0], sides[1]))
 
     def project(self, states: Array) -> Array:
@@ -114,9 +108,8 @@ class Plane:
     def wrapped(self, points: Array) -> Array:
         """Return points (n, 2) with angles inside one turn around the centre."""
         inside = points.copy()
-        for axis in range(2):
-            if self.angles[axis]:
-                inside[:, axis] = wrap(points[:, axis], self.centres[axis])
+        for axis in np.flatnonzero(self.angles):
+            inside[:, axis] = wrap(points[:, axis], self.centres[axis])
         return inside
 
     def coverage(self, states: Array) -> float:
@@ -268,8 +261,11 @@ def assess(
         else:
             outcome = _controlled(spec.system, task, spec.seed, forecast)
         rows += _measured(t, "control", outcome)
-        if feedbacks and t in feedbacks:
-            rows += _measured(t, "feedback", _fed_back(spec.system, task, spec.seed, feedbacks[t]))
+        if feedbacks and t in feedbacks:  # with the noise of the other episodes
+            goal, noise = task.on(spec.system), _control_noise(spec.system, task, spec.seed)
+            truth = true_forecast(spec.system)
+            episode = run_feedback(spec.system, goal, truth, feedbacks[t], noise)
+            rows += _measured(t, "feedback", Outcome(episode.success, episode.cost))
         error = free_run_error(spec.system, forecast, task.free_run_steps)
         rows.append(Assessment(t, "free_run_error", error))
         rows.append(Assessment(t, "coverage", plane.coverage(states[: t + 1])))
@@ -287,13 +283,6 @@ def _controlled(system: System, task: Control, seed: int, forecast: Forecast) ->
     """Run an episode; all of a seed share the noise and the planner's draws."""
     noise, plans = _control_noise(system, task, seed), stream(seed, "control_plans")
     episode = run_episode(system, task, true_forecast(system), forecast, noise, plans)
-    return Outcome(episode.success, episode.cost)
-
-
-def _fed_back(system: System, task: Control, seed: int, feedback: Feedback) -> Outcome:
-    """Run an episode under a law of feedback, with the noise of the other episodes of its seed."""
-    noise = _control_noise(system, task, seed)
-    episode = run_feedback(system, task.on(system), true_forecast(system), feedback, noise)
     return Outcome(episode.success, episode.cost)
 
 

@@ -61,25 +61,24 @@ class _Checked(Planner):
         """
         given: Any = self._plan.choose(view)
         chosen = _array(given)
-        if chosen is None or chosen.dtype.kind not in "fiu":
-            raise self._wrong(given, view)
-        if not np.isfinite(chosen).all() and np.abs(view.parameters).max() < OVERFLOWING:
-            raise self._wrong(given, view)
-        return chosen
+        if (
+            chosen is not None
+            and chosen.dtype.kind in "fiu"
+            and (np.isfinite(chosen).all() or not np.abs(view.parameters).max() < OVERFLOWING)
+        ):
+            return chosen
+        shown = " ".join(repr(given).split())
+        raise SpecificationError(
+            f"choose() of the planner of policy '{self._name}' returned {shown[:80]} at step "
+            f"{view.t}, but an input of finite real numbers, shape {(view.system.n_inputs,)}, is "
+            f"expected: correct its choose()."
+        )
 
     def observe(self, view: TrialView) -> None:
         self._plan.observe(view)
 
     def feedback(self) -> Feedback | None:
         return self._plan.feedback()
-
-    def _wrong(self, given: object, view: TrialView) -> SpecificationError:
-        shown = " ".join(repr(given).split())
-        return SpecificationError(
-            f"choose() of the planner of policy '{self._name}' returned {shown[:80]} at step "
-            f"{view.t}, but an input of finite real numbers, shape {(view.system.n_inputs,)}, is "
-            f"expected: correct its choose()."
-        )
 
 
 def _array(given: Any) -> Array | None:

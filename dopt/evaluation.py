@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.policies.base import ball_norms, on_sphere
 from dopt.systems.base import System, next_state
 from dopt.systems.black_box import BlackBox, transitions
 from dopt.systems.properties import eigenmode
+from dopt.types import Array
 
 if TYPE_CHECKING:
     from dopt.policies.search import TaskOptimal
-
-Array = npt.NDArray[np.float64]
 
 REACHABLE_POINTS = 512
 LONGEST_RUN = 2_000
@@ -72,8 +71,7 @@ def _in_ball(system: System, n: int) -> Array:
     """Return inputs, (n, m), uniform in the ball ‖u‖ ≤ γ; always the same."""
     rng, m = np.random.default_rng(_SEED), system.n_inputs
     directions = on_sphere(rng.standard_normal((n, m)), system.gamma)
-    inputs: Array = directions * ball_norms(rng, (n, 1), m)
-    return inputs
+    return directions * ball_norms(rng, (n, 1), m)
 
 
 def _held_out(system: BlackBox) -> EvaluationSet:
@@ -167,16 +165,23 @@ def simulate(system: System, inputs: Array) -> Array:
     states[0] = system.initial_state
     with np.errstate(over="ignore", invalid="ignore"):
         for t in range(steps):
-            rate = functools.partial(_flows, system, inputs=inputs[t], step=t)
+            truth = functools.partial(_learned, system, t)
+            rate = functools.partial(rates, system, truth, inputs[t])
             states[t + 1] = next_state(system.integrator, rate, states[t], system.dt)
     return states
 
 
-def _flows(system: System, states: Array, inputs: Array, step: int) -> Array:
-    """Return f(x, u) at a step, (n, d), for states (n, d) and inputs (n, m)."""
+def _learned(system: System, step: int, states: Array, inputs: Array) -> Array:
+    return system.learned(states, step, inputs)
+
+
+def rates(
+    system: System, accelerations: Callable[[Array, Array], Array], inputs: Array, states: Array
+) -> Array:
+    """Return dx/dt, (N, d), of states (N, d) under inputs (N, m), with accelerations (N, r)."""
     known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
-    flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-    flow[:, list(system.learned_rows)] += system.learned(states, step, inputs)
+    flow = np.stack(np.broadcast_arrays(*known, states[:, 0])[:-1], axis=-1)
+    flow[:, list(system.learned_rows)] += accelerations(states, inputs)
     return flow
 
 

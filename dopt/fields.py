@@ -139,13 +139,6 @@ class Validated:
             object.__setattr__(self, field.name, _converted(path, field, kinds[field.name], value))
 
     @classmethod
-    def numeric_fields(cls) -> list[dataclasses.Field[Any]]:
-        """Return the fields that hold one number, or one number or None, as declared."""
-        kinds = _kinds(cls)
-        single = {name for name, kind in kinds.items() if kind.type is not str and not kind.listed}
-        return [field for field in dataclasses.fields(cls) if field.name in single]
-
-    @classmethod
     def _path(cls, field: str) -> str:
         return f"{getattr(cls, 'section', 'trial')}.{field}"
 
@@ -188,8 +181,9 @@ def _kind(cls: type[Validated], field: dataclasses.Field[Any]) -> _Kind:
     )
     entries = {float} if entries == {int, float} else entries
     if len(entries) != 1 or not entries <= {int, float, str}:
+        shown = annotation.__name__ if isinstance(annotation, type) else annotation
         raise SpecificationError(
-            f"{cls._path(field.name)} of {cls.__name__} is annotated as {_shown(annotation)}, but "
+            f"{cls._path(field.name)} of {cls.__name__} is annotated as {shown}, but "
             f"int, float, str, a tuple of one of them, or one of these with '| None' is "
             f"expected: change the annotation."
         )
@@ -219,10 +213,6 @@ def _annotation(cls: type[Validated], field: dataclasses.Field[Any]) -> Any:
 
 
 _ANNOTATIONS = "__annotations__"
-
-
-def _shown(annotation: object) -> str:
-    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
 
 
 def _converted(path: str, field: dataclasses.Field[Any], kind: _Kind, value: object) -> object:
@@ -354,10 +344,12 @@ class KernelPart(KernelSupport):
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of most parts, the fields are enough
         """Return the numbers that the function takes, for q parameters and λ of M₀ = λI.
 
-        They are the numeric fields in the order of their declaration, base classes first; None is
-        NaN. Added fields (:func:`dopt.fields.parameter`) are left out: the
-        numbers of a class that is derived from theirs keep their places.
+        They are the fields that hold one number, or one number or None, in the order of their
+        declaration, base classes first; None is NaN. Added fields (:func:`dopt.fields.parameter`)
+        are left out: the numbers of a class that is derived from theirs keep their places.
         """
-        fields = [field for field in self.numeric_fields() if not field.metadata.get("added")]
-        values = [getattr(self, field.name) for field in fields]
+        kinds, fields = _kinds(type(self)).items(), dataclasses.fields(self)
+        single = {name for name, kind in kinds if kind.type is not str and not kind.listed}
+        single -= {field.name for field in fields if field.metadata.get("added")}
+        values = [getattr(self, field.name) for field in fields if field.name in single]
         return tuple(math.nan if value is None else float(value) for value in values)

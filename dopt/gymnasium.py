@@ -6,7 +6,6 @@ It needs the extra ``gymnasium``. Importing this module makes the systems known 
 
 from __future__ import annotations
 
-import functools
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -274,11 +273,8 @@ class Exploration(gymnasium.Env):
         gamma, limit = self.system.gamma, self.system.state_limit
         self.action_space = Box(-gamma, gamma, (self.system.n_inputs,), np.float64)
         self.observation_space = Box(-limit, limit, (self.system.n_states,), np.float64)
-        n_features = len(self.system.features)
-        sizes = (UNITS, n_features + 1)
-        self._layer = MLP(width=UNITS, depth=1).initial_parameters(
-            self.system, np.random.default_rng(_SEED)
-        )[: sizes[0] * sizes[1]]
+        rng, size = np.random.default_rng(_SEED), UNITS * (len(self.system.features) + 1)
+        self._layer = MLP(width=UNITS, depth=1).initial_parameters(self.system, rng)[:size]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -293,17 +289,18 @@ class Exploration(gymnasium.Env):
         system, u = self.system, np.asarray(action, dtype=np.float64)
         u = u * min(1.0, system.gamma / max(float(np.linalg.norm(u)), 1e-300))
         noise = system.noise * np.sqrt(system.dt) * self.np_random.standard_normal(system.n_states)
-        rate = functools.partial(self._flow, u=u)
-        self._state = next_state(system.integrator, rate, self._state, system.dt) + noise
+        following = next_state(
+            system.integrator,
+            lambda x: system.derivative(x, u, self._steps),
+            self._state,
+            system.dt,
+        )
+        self._state = following + noise
         self._steps += 1
         limit = system.state_limit
         terminated = not bool(np.all(np.abs(self._state) <= limit))
         observed = np.clip(np.nan_to_num(self._state, nan=limit), -limit, limit)
         return observed, self._gain(observed), terminated, False, {"input": u}
-
-    def _flow(self, x: Array, u: Array) -> Array:
-        """Return f(x, u), (d,), of the system as it is at step t."""
-        return self.system.derivative(x, u, self._steps)
 
     def _gain(self, state: Array) -> float:
         """Return the information gained at a state, and take it in (Sherman and Morrison)."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -92,7 +92,10 @@ class Limits(Validated):
         """Return the section that :meth:`from_section` turns into these limits."""
         return {
             "name": self.name,
-            "bounds": {name: [_finite(low), _finite(high)] for name, low, high in self.bounds},
+            "bounds": {
+                name: [end if math.isfinite(end) else None for end in pair]
+                for name, *pair in self.bounds
+            },
             "rates": dict(self.rates),
             "steps": self.steps,
             "margin": self.margin,
@@ -102,7 +105,8 @@ class Limits(Validated):
     def check(self, system: System) -> None:
         """Refuse a name that a system does not have, and bounds that it cannot heed."""
         states, inputs = names_of(system.state_labels), names_of(system.input_labels)
-        if not self.rates and not any(map(math.isfinite, _ends(self.bounds))):
+        ends = [end for _, *pair in self.bounds for end in pair]
+        if not self.rates and not any(map(math.isfinite, ends)):
             raise SpecificationError(
                 "limits have neither a bound nor a rate, but at least one is expected: set "
                 f"limits.bounds of {', '.join((*states, *inputs))}, or choose limits=none."
@@ -130,8 +134,7 @@ class Limits(Validated):
 
     def changes(self, system: System) -> Array:
         """Return the largest change of each input from one step to the next, (m,)."""
-        rates = dict(self.rates)
-        names = names_of(system.input_labels)
+        rates, names = dict(self.rates), names_of(system.input_labels)
         return np.array([rates.get(name, math.inf) * system.dt for name in names])
 
     def excess(self, system: System, states: Array) -> Array:
@@ -169,11 +172,6 @@ def names_of(labels: Sequence[str]) -> list[str]:
     return [label.partition(" [")[0] for label in labels]
 
 
-def _ends(bounds: Iterable[tuple[str, float, float]]) -> Iterator[float]:
-    for _, low, high in bounds:
-        yield from (low, high)
-
-
 def _named(section: Mapping[str, Any], key: str) -> list[tuple[str, Any]]:
     given = section.get(key)
     if given is None:
@@ -187,9 +185,7 @@ _PAIR = "a pair of numbers, the lower one first, or null for none"
 
 
 def _pair(name: str, given: object) -> tuple[object, object]:
-    if isinstance(given, str | Mapping) or not isinstance(given, Sequence | np.ndarray):
-        raise _unlike(f"bounds.{name}", given, _PAIR)
-    if len(given) != 2:
+    if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray) or len(given) != 2:
         raise _unlike(f"bounds.{name}", given, _PAIR)
     return given[0], given[1]
 
@@ -219,10 +215,6 @@ def _number(given: object) -> float:
         return float(given)
     except (OverflowError, TypeError):
         return math.nan
-
-
-def _finite(bound: float) -> float | None:
-    return bound if math.isfinite(bound) else None
 
 
 def _unlike(what: str, given: object, expected: str) -> SpecificationError:

@@ -403,9 +403,7 @@ class Log:
         unit_of = _units_of(units or {}, named, clock)
         stamps = stamps_of(table, clock, time, dt, unit_of.get(clock or "time", 1.0), notes)
         measured, applied = (
-            np.column_stack(
-                [values_of(name, table[name], unit_of, notes) for name in found.values()]
-            )
+            np.column_stack([values_of(one, table[one], unit_of, notes) for one in found.values()])
             for found in named
         )
         _note_missing(self.states, measured, notes)
@@ -548,7 +546,12 @@ def _without_gaps(
         notes.append(f"Without time or input, not used, pieces end there: {rows_text(lost)}.")
     begins = np.diff(rows, prepend=-2) > 1  # a piece begins
     again = (np.diff(t[rows], prepend=np.nan) == 0) & ~begins
-    _check_repeated(again)
+    if 2 * int(again.sum()) > again.size:
+        raise SpecificationError(
+            f"{int(again.sum()):,} of {again.size:,} rows of a log repeat the stamp of the row "
+            f"before them, but a stamp for each row is expected: give stamps with more digits, or "
+            f"the time between two rows as dt."
+        )
     if again.any():
         notes.append(f"Stamp of the row before repeated, left out: {rows_text(rows[again])}.")
     rows, begins = rows[~again], begins[~again]
@@ -582,15 +585,6 @@ def _without_gaps(
     if alone:
         notes.append(f"Alone between two gaps, left out: {rows_text(np.concatenate(alone))}.")
     return [piece for piece in pieces if len(piece) > 1]
-
-
-def _check_repeated(again: Booleans) -> None:
-    if 2 * int(again.sum()) > again.size:
-        raise SpecificationError(
-            f"{int(again.sum()):,} of {again.size:,} rows of a log repeat the stamp of the row "
-            f"before them, but a stamp for each row is expected: give stamps with more digits, or "
-            f"the time between two rows as dt."
-        )
 
 
 def _out_of_order(t: Array, begins: Booleans) -> Booleans:

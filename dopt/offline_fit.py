@@ -34,8 +34,7 @@ from dopt.randomness import initial_weights
 from dopt.spec.compatibility import Information, held_information
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,10 +284,8 @@ def _fit_network(
     from dopt.kernel.learners import Problem, fit
     from dopt.kernel.pointers import compiled_for, kind_of
 
-    network, features = (
-        network_of(spec.system, spec.model),
-        spec.model.featurize(spec.system, points),
-    )
+    network = network_of(spec.system, spec.model)
+    features = spec.model.featurize(spec.system, points)
     columns = (np.array(rows.T, order="C") for rows in (features, accelerations))
     problem, theta = Problem(network, initial, float(ridge), *columns), initial.copy()
     kinds = tuple(map(kind_of, (problem, theta, most)))

@@ -13,13 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import SpecificationError
-from dopt.learning import AdamReplay, Learner
+from dopt.learning import AdamReplay
 from dopt.policies import ICEM
-from dopt.policies.base import ROUNDING, OpenLoop, Policy, ball_norms, on_sphere
+from dopt.policies.base import ROUNDING, OpenLoop, ball_norms, on_sphere
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array
 
 _STREAMS = {
     "noise": 0,
@@ -102,6 +101,14 @@ def draw(spec: TrialSpec) -> Draws:
     """Draw the random numbers of a trial."""
     system, policy, seed = spec.system, spec.policy, spec.seed
     sphere = (system.horizon, system.n_inputs)
+    plans, parameters, replay = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0), np.int64)
+    if isinstance(policy, ICEM):
+        plans = policy.draw_plans(system, stream(seed, "sampled_plans"))
+        plans = plans.reshape(len(plans), -1)
+        q = spec.model.n_member_parameters(system)
+        parameters = policy.draw_parameters(q, stream(seed, "sampled_parameters"))
+    if isinstance(spec.learner, AdamReplay):
+        replay = spec.learner.places(system.horizon, stream(seed, "replay"))
     if isinstance(policy, OpenLoop):
         inputs = _open_loop(policy, system, stream(seed, "inputs"))
     else:
@@ -114,24 +121,10 @@ def draw(spec: TrialSpec) -> Draws:
         components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
         ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
         radii=_radii(spec),
-        replay=_replay(spec.learner, system.horizon, seed),
-        plans=_plans(policy, system, seed),
-        parameters=_parameters(spec),
+        replay=replay,
+        plans=plans,
+        parameters=parameters,
     )
-
-
-def _plans(policy: Policy, system: System, seed: int) -> Array:
-    if isinstance(policy, ICEM):
-        numbers = policy.draw_plans(system, stream(seed, "sampled_plans"))
-        return numbers.reshape(len(numbers), -1)
-    return np.zeros((0, 0))
-
-
-def _parameters(spec: TrialSpec) -> Array:
-    if isinstance(spec.policy, ICEM):
-        q = spec.model.n_member_parameters(spec.system)
-        return spec.policy.draw_parameters(q, stream(spec.seed, "sampled_parameters"))
-    return np.zeros((0, 0))
 
 
 def _radii(spec: TrialSpec) -> Array:
@@ -152,8 +145,7 @@ def process_noise(system: System, seed: int) -> Array:
 def measurement_noise(system: System, seed: int) -> Array:
     """Return v_{t+1} of y = C x + v, (T, n), for the measured states."""
     noise = stream(seed, "measurement_noise").standard_normal((system.horizon, system.n_measured))
-    scaled: Array = np.array(system.measurement_noise) * noise
-    return scaled
+    return np.array(system.measurement_noise) * noise
 
 
 def initial_weights(spec: TrialSpec) -> Array:
@@ -178,9 +170,3 @@ def _open_loop(policy: OpenLoop, system: System, rng: np.random.Generator) -> Ar
             f"{system.gamma:g}: scale it down, or set exceeds = True in its class if that is meant."
         )
     return inputs.astype(np.float64)
-
-
-def _replay(learner: Learner, horizon: int, seed: int) -> npt.NDArray[np.int64]:
-    if isinstance(learner, AdamReplay):
-        return learner.places(horizon, stream(seed, "replay"))
-    return np.zeros((0, 0, 0), dtype=np.int64)

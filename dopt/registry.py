@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, TypeVar, cast
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, check_own_fields
@@ -58,20 +58,17 @@ def build(section: str, registry: Mapping[str, type[T]], given: Part) -> T:
     return cls(**{key: value for key, value in given.items() if key not in _ABOUT})
 
 
-@runtime_checkable
-class Wrapper(Protocol):
-    """A specification of something that is no dataclass of ours, which writes its own section."""
-
-    def to_section(self) -> dict[str, object]: ...
-
-
 def section_of(item: Validated) -> dict[str, object]:
     """Return the configuration section that :func:`build` turns into ``item``."""
-    if isinstance(item, Wrapper):
-        return item.to_section()
+    if hasattr(item, "to_section"):  # of something that is no dataclass of ours
+        written: dict[str, object] = item.to_section()
+        return written
     fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
     listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
-    return {"name": getattr(item, "name", None), **_origin(type(item)), **listed}
+    cls, origin = type(item), dict[str, object]()
+    if cls.__module__.partition(".")[0] != __name__.partition(".")[0]:  # of the user's own
+        origin = {TARGET: _target(cls), SOURCE: source_digest(cls)}
+    return {"name": getattr(item, "name", None), **origin, **listed}
 
 
 def identifying_section(item: Validated) -> dict[str, object]:
@@ -112,19 +109,14 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
     """Import a class of the user's own and see that it fits."""
     path = str(given[TARGET])
     own = _fitting(section, registry, path, imported(section, path, given))
-    name = own.__dict__["name"]
-    if given.get("name", name) != name:
-        raise SpecificationError(
-            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
-            f"leave {section}.name out, or correct it."
-        )
-    check_source(section, path, own, given)
+    check_source(section, path, own, given, own.__dict__["name"])
     return own
 
 
 def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any) -> type[T]:
     """Return a class of the user's own that fits into a section."""
-    wanted = _base(next(iter(registry.values())))
+    shipped = next(iter(registry.values()))
+    wanted = next(base for base in shipped.__mro__ if "section" in base.__dict__)
     if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
         raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
     check_own_fields(cls)
@@ -138,8 +130,15 @@ def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any)
     return own
 
 
-def check_source(section: str, path: str, cls: type, given: Mapping[str, object]) -> None:
-    """Refuse a section that was stored when the file of its class was another one."""
+def check_source(
+    section: str, path: str, cls: type, given: Mapping[str, object], name: str
+) -> None:
+    """Refuse a section of another name, or stored when the file of its class was another one."""
+    if given.get("name", name) != name:
+        raise SpecificationError(
+            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
+            f"leave {section}.name out, or correct it."
+        )
     if given.get(SOURCE, source_digest(cls)) != source_digest(cls):
         raise _changed(section, path)
 
@@ -157,11 +156,6 @@ def check_stored(config: Mapping[str, object]) -> None:
                 f"digest of the file is expected, as no unknown code is run: register the trial "
                 f"again with a launch of your own."
             )
-
-
-def _base(cls: type[Validated]) -> type[Validated]:
-    """Return the class that declares the section of a specification."""
-    return next(base for base in cls.__mro__ if "section" in base.__dict__)
 
 
 def imported(section: str, path: str, given: Mapping[str, object] | None = None) -> object:
@@ -273,13 +267,6 @@ def _unfit(section: str, path: str, expected: str) -> SpecificationError:
     )
 
 
-def _origin(cls: type[Validated]) -> dict[str, object]:
-    """Return what identifies a class of the user's own; nothing for one of this package."""
-    if cls.__module__.partition(".")[0] == __name__.partition(".")[0]:
-        return {}
-    return {TARGET: _target(cls), SOURCE: source_digest(cls)}
-
-
 def _target(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
@@ -313,6 +300,9 @@ def source_digest(cls: type) -> str:
     return _digests[cls]
 
 
+_digests: dict[type, str] = {}
+
+
 def _digest(content: bytes) -> str:
     """Return the digest of a text, which does not depend on how its lines end."""
     text = content.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -342,9 +332,6 @@ def _cell(cls: type) -> str:
     return next((text for text in texts if re.search(rf"class {cls.__name__}\b", text)), "")
 
 
-_digests: dict[type, str] = {}
-
-
 def check_returned(whose: str, method: str, found: object, base: type) -> None:
     """Refuse what has not the methods of ``base``; ``whose`` names the class in a message.
 
@@ -357,23 +344,14 @@ def check_returned(whose: str, method: str, found: object, base: type) -> None:
     missing = [key for key in wanted if not callable(getattr(found, key, None))]
     if not missing and not isinstance(found, type):
         return
+    shown, remedy = "None", f"add the return statement to {method}()"
+    if isinstance(found, type):
+        shown = f"the class {found.__name__} itself"
+        remedy = f"return {found.__name__}(...), an object of it"
+    elif found is not None:
+        shown = f"an object of type {type(found).__name__}"
+        remedy = f"return one that has {', '.join(missing)}"
     raise SpecificationError(
-        f"{method}() of {whose} returned {_shown(found)}, but an object of a class derived from "
-        f"{base.__module__}.{base.__name__} is expected: {_remedy(found, method, missing)}."
+        f"{method}() of {whose} returned {shown}, but an object of a class derived from "
+        f"{base.__module__}.{base.__name__} is expected: {remedy}."
     )
-
-
-def _shown(found: object) -> str:
-    if found is None:
-        return "None"
-    if isinstance(found, type):
-        return f"the class {found.__name__} itself"
-    return f"an object of type {type(found).__name__}"
-
-
-def _remedy(found: object, method: str, missing: list[str]) -> str:
-    if found is None:
-        return f"add the return statement to {method}()"
-    if isinstance(found, type):
-        return f"return {found.__name__}(...), an object of it"
-    return f"return one that has {', '.join(missing)}"

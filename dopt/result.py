@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.control.task import Feedback
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array
 
 
 class Assessment(NamedTuple):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +15,7 @@ from dopt.assessment import assessed
 from dopt.errors import SpecificationError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-
-if TYPE_CHECKING:
-    from dopt.kernel.run import KernelTrial, SteppedTrial  # which loads the compiler
-    from dopt.reference.batch import ReferenceTrial
+from dopt.types import Array
 
 Path = Literal["kernel", "reference"]
 
@@ -59,9 +56,6 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     return assessed(spec, run_trial_in_kernel(spec))
 
 
-Array = npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class Rerun:
     """States of a trial, and the model's parameters after chosen steps.
@@ -93,27 +87,34 @@ def rerun(spec: TrialSpec, steps: Sequence[int]) -> Rerun:
         raise SpecificationError(f"the steps {list(steps)} do not ascend: sort them.")
     if steps and steps[0] < 0:
         raise SpecificationError(f"step {steps[0]} was asked for, but the first is 0: begin there.")
-    trial = _run(spec)
-    seen: list[int] = []
-    parameters: list[Array] = []
+    seen, states = (_seen_in_torch if spec.config.path == "reference" else _seen)(spec, steps)
+    parameters = np.array([*seen.values()]).reshape(-1, spec.model.n_parameters(spec.system))
+    return Rerun(np.array([*seen], dtype=np.int64), parameters, states)
+
+
+def _seen(spec: TrialSpec, steps: Sequence[int]) -> tuple[Mapping[int, Array], Array]:
+    """Return the parameters after each step that is reached, and the states."""
+    from dopt.kernel.run import trial_in_kernel
+
+    trial, seen = trial_in_kernel(spec), dict[int, Array]()
     for step in steps:
         trial.advance(step)
         if trial.diverged_at is not None:
             break
-        seen.append(step)
-        parameters.append(trial.parameters.copy())
+        seen[step] = trial.parameters.copy()
     states = trial.states.copy()
     if trial.diverged_at is not None:
         states[trial.diverged_at :] = np.nan
-    q = spec.model.n_parameters(spec.system)
-    return Rerun(np.array(seen, dtype=np.int64), np.array(parameters).reshape(-1, q), states)
+    return seen, states
 
 
-def _run(spec: TrialSpec) -> KernelTrial | SteppedTrial | ReferenceTrial:
-    if spec.config.path == "reference":
-        from dopt.reference.batch import ReferenceTrial
+def _seen_in_torch(spec: TrialSpec, steps: Sequence[int]) -> tuple[Mapping[int, Array], Array]:
+    from dopt.reference.batch import run_trials
 
-        return ReferenceTrial(spec)
-    from dopt.kernel.run import trial_in_kernel
-
-    return trial_in_kernel(spec)
+    if steps and steps[-1] > spec.system.horizon:
+        raise SpecificationError(
+            f"step {steps[-1]} was asked for, but the horizon is {spec.system.horizon}: raise "
+            f"env.horizon."
+        )
+    result = run_trials([spec], noted=steps)[0]
+    return result.checkpoints, result.states

@@ -11,9 +11,24 @@ if __name__ == "__main__":
     run("orchestrate.__main__")  # what cannot be imported is answered, too
 
 from dopt.errors import unknown_name
-from orchestrate.commands import COMMANDS
-from orchestrate.commands.command import PROGRAM, say
+from orchestrate.commands import PROGRAM, Command, design, export, maintenance, results, say, status
 from orchestrate.errors import ExitCode
+
+COMMANDS: tuple[Command, ...] = (
+    status.WORK_COMMAND,
+    status.STATUS_COMMAND,
+    results.SHOW_COMMAND,
+    maintenance.RETRY_COMMAND,
+    results.QUERY_COMMAND,
+    export.EXPORT_COMMAND,
+    maintenance.MERGE_COMMAND,
+    maintenance.DOCTOR_COMMAND,
+    maintenance.UPGRADE_COMMAND,
+    maintenance.BACKUP_COMMAND,
+    maintenance.PRUNE_COMMAND,
+    design.DESIGN_COMMAND,
+)
+"""In the order in which the help shows them."""
 
 
 @answered
@@ -23,7 +38,12 @@ def main(words: Sequence[str] | None = None) -> int:
     if not given or given[0] in ("-h", "--help", "help"):
         say(overview())
         return ExitCode.DONE
-    return _run(given[0], given[1:])
+    name, *rest = given
+    commands = {command.name: command for command in COMMANDS}
+    if name not in commands:
+        check_removed(f"orchestrate {name}")
+        raise unknown_name("command", name, commands)
+    return commands[name].run(commands[name].parser().read(rest, mixed=True))
 
 
 def overview() -> str:
@@ -32,12 +52,3 @@ def overview() -> str:
     lines = [f"  {command.name:<{width}}  {command.help}" for command in COMMANDS]
     usage = f"Usage: {PROGRAM} COMMAND [--db URL] [--json] ..., or {PROGRAM} --version"
     return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help shows its options."])
-
-
-def _run(name: str, words: Sequence[str]) -> int:
-    commands = {command.name: command for command in COMMANDS}
-    if name not in commands:
-        check_removed(f"orchestrate {name}")
-        raise unknown_name("command", name, commands)
-    command = commands[name]
-    return command.run(command.parser().read(words, mixed=True))

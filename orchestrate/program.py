@@ -169,40 +169,31 @@ def check_removed(typed: str) -> None:
 
 def positive(option: str, number: type[int] | type[float]) -> Callable[[str], float]:
     """Return the argument type for a number above 0."""
+    expected = f"a {'whole number' if number is int else 'number'} above 0"
+    return partial(_number, option, number, expected, lambda value: 0 < value < float("inf"))
 
-    def read(given: str) -> float:
-        try:
-            value = number(given)
-        except ValueError:
-            value = number(0)
-        if not 0 < value < float("inf"):
-            kind = "whole number" if number is int else "number"
-            raise UsageError(f"{option} is {given!r}, a {kind} above 0 is expected: give one.")
-        return value
 
-    return read
+def integer(option: str) -> Callable[[str], int]:
+    """Return the argument type for a whole number that a database can hold, 0 or above."""
+    expected = "a whole number from 0 to 2^63 - 1"
+    return partial(_number, option, int, expected, lambda value: 0 <= value < 2**63)
+
+
+def _number(
+    option: str, kind: Callable[[str], Any], expected: str, fits: Callable[[Any], bool], given: str
+) -> Any:
+    try:
+        value = kind(given)
+    except ValueError:
+        value = -1
+    if not fits(value):
+        raise UsageError(f"{option} is {given!r}, {expected} is expected: give one.")
+    return value
 
 
 def path(option: str) -> Callable[[str], Path]:
     """Return the argument type for the path of a file or folder."""
     return partial(given_path, what=option, refusal=UsageError)
-
-
-def integer(option: str) -> Callable[[str], int]:
-    """Return the argument type for a whole number that a database can hold, 0 or above."""
-
-    def read(given: str) -> int:
-        try:
-            value = int(given)
-        except ValueError:
-            value = -1
-        if not 0 <= value < 2**63:
-            raise UsageError(
-                f"{option} is {given!r}, a whole number from 0 to 2^63 - 1 is expected: give one."
-            )
-        return value
-
-    return read
 
 
 LONGEST = 100 * 365 * 86_400

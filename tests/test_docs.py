@@ -20,7 +20,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate import __main__ as orchestrate
 from orchestrate import launch
-from orchestrate.commands import COMMANDS
+from orchestrate.__main__ import COMMANDS
 from tests.analysis.synthetic import fill, make_grid
 from tests.orchestrate.commands.test_design import LIMITS, ROBOT
 from tests.pages import GENERATED, PAGES, Command, blocks, commands

@@ -61,7 +61,7 @@ def test_all_members_of_the_public_classes_are_in_the_reference(listed: set[str]
         f"{cls.__module__}.{cls.__name__}.{name}"
         for cls in classes
         for name in dir(cls)
-        if not name.startswith("_") and name != "numeric_fields"  # for the kernel
+        if not name.startswith("_")
     }
     assert {f"dopt.explorer.explorer.Explorer.{name}" for name in ("tell", "save")} <= members
     assert members - listed == set()

@@ -317,10 +317,9 @@ def newest(configs: list[ConfigRow]) -> list[ConfigRow]:
         and _assessment_version(config) in (None, assessment)
     ]
     criteria: dict[str, int] = {}
-    for config in found:
-        content, version = _criterion(config)
+    for content, version in map(_criterion, found):
         criteria[content] = max(version, criteria.get(content, version))
-    return [config for config in found if _criterion(config)[1] == criteria[_criterion(config)[0]]]
+    return [one for one in found if criteria[_criterion(one)[0]] == _criterion(one)[1]]
 
 
 def _criterion(config: ConfigRow) -> tuple[str, int]:
@@ -354,23 +353,26 @@ def latest_sources(
 
 def source_notes(configs: Iterable[ConfigRow], chosen: Sequence[ConfigRow]) -> Iterable[str]:
     """Yield sentences on configurations of other files than those that are shown."""
-    shown: dict[tuple[str, str, object], set[str]] = {}
-    for config in chosen:
-        for path, (target, digest) in _sources(config).items():
-            shown.setdefault((config.env, path, target), set()).add(digest)
-    others: dict[tuple[str, str, object], set[str]] = {}
-    for config in configs:
-        for path, (target, digest) in _sources(config).items():
-            place = config.env, path, target
-            if digest not in shown.get(place, {digest}):
-                others.setdefault(place, set()).add(digest)
-    for (env, path, target), digests in sorted(others.items(), key=lambda item: str(item[0])):
-        here = ", ".join(sorted(shown[env, path, target]))
-        ways = " or ".join(f"--where {path}={_argument(digest)}" for digest in sorted(digests))
+    shown, stored = _digests(chosen), _digests(configs)
+    for (env, path, target), digests in sorted(shown.items(), key=lambda item: str(item[0])):
+        others = sorted(stored.get((env, path, target), digests) - digests)
+        if not others:
+            continue
+        here = ", ".join(sorted(digests))
+        ways = " or ".join(f"--where {path}={_argument(digest)}" for digest in others)
         yield (
             f"{env}: {path} differs, as the file of {target} was edited: these trials have {here}, "
             f"trials of other states of the file are left out (see {ways})"
         )
+
+
+def _digests(configs: Iterable[ConfigRow]) -> dict[tuple[str, str, object], set[str]]:
+    """Return the digests of each user's class in an environment, by the path of the digest."""
+    found: dict[tuple[str, str, object], set[str]] = {}
+    for config in configs:
+        for path, (target, digest) in _sources(config).items():
+            found.setdefault((config.env, path, target), set()).add(digest)
+    return found
 
 
 def _sources(config: ConfigRow) -> dict[str, tuple[object, str]]:

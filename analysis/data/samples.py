@@ -38,7 +38,14 @@ from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
-from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
+from orchestrate.store import (
+    CONFIG_COLUMNS,
+    Assessments,
+    ConfigRow,
+    Curves,
+    Reader,
+    default_url,
+)
 from orchestrate.store.records import stacked
 
 Array = npt.NDArray[np.float64]
@@ -135,11 +142,10 @@ def violation_shares(reader: Reader, entry: Entry) -> dict[int, float]:
     """
     found = reader.assessments(entry.config.config_key, VIOLATIONS)
     values = found.values / np.maximum(found.t, 1)
-    counted = {
-        int(seed): row[np.isfinite(row)] for seed, row in zip(found.seeds, values, strict=True)
-    }
-    finished = [trial.seed for trial in entry.finished]
-    return {seed: float(counted[seed].sum()) for seed in finished if len(counted.get(seed, ())) > 0}
+    counted = dict(zip(found.seeds.tolist(), values, strict=True))
+    rows = {one.seed: counted[one.seed] for one in entry.finished if one.seed in counted}
+    finite = {seed: row[np.isfinite(row)] for seed, row in rows.items()}
+    return {seed: float(row.sum()) for seed, row in finite.items() if len(row)}
 
 
 def sample_losses(reader: Reader, entry: Entry) -> dict[int, float]:
@@ -415,18 +421,10 @@ class Results:
     def _tidy(self, config: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
         with self.reader.moment() as moment:
             read = {name: moment.curves(config.config_key, name) for name in columns}
-        first = next(iter(read.values()))
-        n, steps = first.values.shape
-        frame = pd.DataFrame(
-            {
-                "seed": np.repeat(first.seeds, steps),
-                "t": np.tile(first.t, n),
-                "time": np.tile(config.dt * first.t, n),
-                "diverged": np.repeat(first.diverged, steps),
-                **{name: column.values.ravel() for name, column in read.items()},
-            }
-        )
-        return _labelled(frame, config)
+        values = {name: column.values.ravel() for name, column in read.items()}
+        frame = _long(next(iter(read.values())))
+        frame.insert(2, "time", config.dt * frame["t"])
+        return _labelled(frame.assign(**values), config)
 
     def assessments(self, *measures: str) -> pd.DataFrame:
         """Return one row for each finished trial, measure and number of explored steps ``t``.
@@ -445,15 +443,8 @@ class Results:
 
     def _measured(self, config: ConfigRow, measure: str) -> pd.DataFrame:
         found = self.reader.assessments(config.config_key, measure)
-        n, steps = found.values.shape
-        columns = (
-            np.repeat(found.seeds, steps),
-            np.tile(found.t, n),
-            measure,
-            found.values.ravel(),
-            np.repeat(found.diverged, steps),
-        )
-        return _labelled(pd.DataFrame(dict(zip(_MEASURED, columns, strict=True))), config)
+        frame = _long(found).assign(measure=measure, value=found.values.ravel())
+        return _labelled(frame[list(_MEASURED)], config)
 
     def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
         """Return one column of the steps of a policy in an environment as a matrix (seed, t).
@@ -526,6 +517,13 @@ class Results:
                 f"it holds {len(configs)} in all: run the grid first, or ask for less."
             )
         return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
+
+
+def _long(found: Curves | Assessments) -> pd.DataFrame:
+    """Return a row for each trial and step: its seed, t and whether the trial diverged."""
+    n, steps = found.values.shape
+    columns = {"seed": np.repeat(found.seeds, steps), "t": np.tile(found.t, n)}
+    return pd.DataFrame({**columns, "diverged": np.repeat(found.diverged, steps)})
 
 
 def _labelled(frame: pd.DataFrame, config: ConfigRow) -> pd.DataFrame:

@@ -354,9 +354,6 @@ def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable
         yield Gap(env, policy, tuple(sorted(expected)), f"{len(expected)} not registered")
 
 
-Weight = Callable[[Entry], tuple[int, ...]]
-
-
 def one_world(entries: Sequence[Entry], name: str = "env") -> list[Entry]:
     """Return the entries of the env section with most trials; entries are of one environment.
 
@@ -370,15 +367,14 @@ def one_world(entries: Sequence[Entry], name: str = "env") -> list[Entry]:
     return [entry for entry in entries if section_text(entry, name) == world]
 
 
-def number_of_trials(entry: Entry) -> tuple[int, ...]:
-    """Return the weight of an entry by which the one with most trials is the largest."""
-    return (len(entry.trials),)
-
-
-def one_each(entries: Sequence[Entry], weight: Weight = number_of_trials) -> list[Entry]:
+def one_each(
+    entries: Sequence[Entry],
+    weight: Callable[[Entry], tuple[int, ...]] = lambda one: (len(one.trials),),
+) -> list[Entry]:
     """Return the entry of the largest weight for each policy, model, learner, limits and path.
 
-    Several differ in their task alone: the losses of a trial are the same with any and without one.
+    The weight is by default the number of trials. Several differ in their task alone: the losses of
+    a trial are the same with any and without one.
     """
     groups: dict[tuple[str, ...], list[Entry]] = {}
     for entry in entries:

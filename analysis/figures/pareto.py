@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,6 @@ from analysis.data.selection import (
     environment_rank,
     labelled,
     labels_of,
-    number_of_trials,
     one_each,
     one_world,
     policy_rank,
@@ -53,7 +53,6 @@ from analysis.style import (
     environment_title,
     loss_unit,
     policy_style,
-    text_by_environment,
 )
 from dopt.spec.trial import system_of
 from orchestrate.store import Reader
@@ -76,60 +75,6 @@ _RULES = {
 }
 
 
-@dataclass(frozen=True)
-class Point:
-    """One configuration in one environment.
-
-    Attributes
-    ----------
-    label : str
-        Settings that differ among the configurations of the environment.
-    policy, policy_label, learner_label : str
-        Name of the policy; the policy and the learner with their settings that differ. The
-        learner's are followed by the model, where it is another one than the network.
-    us_per_step : float
-        Microseconds of planning and learning in a step: mean over the steps of a trial, median over
-        trials that did not diverge; NaN without any.
-    loss, low, high : float
-        Final loss, geometric mean over trials with its interval, in ``unit``; NaN where none is
-        left.
-    n, n_finished, n_diverged : int
-        Trials in the loss, trials that ended, and how many of these diverged.
-    counts : str
-        These numbers as a text.
-    limit_us : float
-        Time between two steps, dt [µs].
-    on_front : bool
-        No other configuration of the environment has a lower loss in a step that is as fast, or
-        the same loss in a faster one.
-    """
-
-    env: str
-    label: str
-    policy: str
-    policy_label: str
-    learner_label: str
-    us_per_step: float
-    loss: float
-    low: float
-    high: float
-    unit: str
-    n: int
-    n_finished: int
-    n_diverged: int
-    counts: str
-    limit_us: float
-    on_front: bool = False
-
-    @property
-    def known(self) -> bool:
-        """True if the point can be drawn."""
-        return bool(np.isfinite(self.us_per_step) and np.isfinite(self.loss))
-
-
-Points = tuple[Point, ...]
-
-
 def pareto_part(selection: Selection) -> Selection:
     """Return all configurations of the environments that have several, without the oracle's."""
     kept: list[Entry] = []
@@ -139,25 +84,52 @@ def pareto_part(selection: Selection) -> Selection:
     ):
         finished = [one for one in group if one.finished and one.config.policy != APART]
         world = one_world(one_world(finished), "limits") if finished else []
-        own = one_each(world, number_of_trials)
+        own = one_each(world)
         kept += own if len(own) >= FEWEST else []
     entries = tuple(labelled(kept))
     return Selection(entries, notes=tuple(unfinished(entries)))
 
 
-def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -> Points:
-    """Return a point for each entry, within an environment ordered by time."""
+def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -> pd.DataFrame:
+    """Return a row for each configuration of an environment, ordered by time within it.
+
+    ``label``: settings that differ among the configurations of the environment; ``policy_label``
+    and ``learner_label``: policy and learner with their settings that differ, the learner's
+    followed by the model, where it is another one than the network. ``us_per_step``: microseconds
+    of planning and learning in a step, mean over the steps of a trial, median over trials that did
+    not diverge. ``loss``, ``low``, ``high``: final loss, geometric mean over trials with its
+    interval, in ``unit``. Both are NaN where no trial is left; the point is then not ``known``.
+    ``n``: trials in the loss; ``counts``: these and those that diverged, as a text. ``limit_us``:
+    time between two steps, dt [µs]. ``on_front``: no other configuration of the environment has a
+    lower loss in a step that is as fast, or the same loss in a faster one.
+    """
     policies = section_words(selection.entries, "policy")
     learners = learner_words(selection.entries)
-    points = [
-        _point(reader, entry, policies[section_text(entry, "policy")], learner, rule)
-        for entry, learner in zip(selection.entries, learners, strict=True)
-    ]
-    return tuple(
-        point
-        for env in selection.environments
-        for point in _with_front([one for one in points if one.env == env])
-    )
+    rows = []
+    for entry, learner in zip(selection.entries, learners, strict=True):
+        scores = final_losses(reader, entry, "loss", rule)
+        system, loss = system_of(entry.config.config), geometric_mean(scores.values)
+        row: dict[str, Any] = {
+            "env": entry.config.env,
+            "label": entry.label,
+            "policy": entry.config.policy,
+        }
+        row |= {"policy_label": policies[section_text(entry, "policy")], "learner_label": learner}
+        row |= {"us_per_step": step_us(reader, entry)}
+        row |= {"loss": loss.value, "low": loss.low, "high": loss.high, "unit": loss_unit(system)}
+        row |= {"n": len(scores.by_seed), "n_diverged": scores.n_diverged}
+        rows.append(row | {"counts": scores.describe(), "limit_us": 1e6 * system.dt})
+    table = pd.DataFrame(rows)
+    costs = table[["us_per_step", "loss"]]
+    front = np.zeros(len(table), dtype=bool)
+    for env in selection.environments:
+        own = (table["env"] == env).to_numpy()
+        front[own] = on_front(costs.to_numpy()[own])
+    table["on_front"] = front
+    table["known"] = np.isfinite(costs.to_numpy(float)).all(axis=1)
+    place = table["env"].map(selection.environments.index)
+    order = np.lexsort((table["us_per_step"], ~table["known"], place))
+    return table.iloc[order].reset_index(drop=True)
 
 
 def learner_words(entries: Sequence[Entry]) -> list[str]:
@@ -187,28 +159,6 @@ def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
     return dict(zip(first, words, strict=True))
 
 
-def _point(reader: Reader, entry: Entry, policy: str, learner: str, rule: DivergenceRule) -> Point:
-    scores = final_losses(reader, entry, "loss", rule)
-    system, loss = system_of(entry.config.config), geometric_mean(scores.values)
-    return Point(
-        env=entry.config.env,
-        label=entry.label,
-        policy=entry.config.policy,
-        policy_label=policy,
-        learner_label=learner,
-        us_per_step=step_us(reader, entry),
-        loss=loss.value,
-        low=loss.low,
-        high=loss.high,
-        unit=loss_unit(system),
-        n=len(scores.by_seed),
-        n_finished=scores.n_finished,
-        n_diverged=scores.n_diverged,
-        counts=scores.describe(),
-        limit_us=1e6 * system.dt,
-    )
-
-
 def step_us(reader: Reader, entry: Entry) -> float:
     """Return the microseconds of planning and learning in a step, NaN without a whole trial.
 
@@ -222,45 +172,32 @@ def step_us(reader: Reader, entry: Entry) -> float:
     return float(np.median(np.mean(plan + learn, axis=1))) if len(plan) else float("nan")
 
 
-def _with_front(points: Sequence[Point]) -> Iterator[Point]:
-    """Yield the points of an environment by their time, with their place on the front."""
-    front = on_front(np.array([(point.us_per_step, point.loss) for point in points]))
-    placed = [replace(one, on_front=bool(is_on)) for one, is_on in zip(points, front, strict=True)]
-    yield from sorted(placed, key=lambda one: (not one.known, one.us_per_step))
-
-
-def policies_of(points: Points) -> dict[str, str]:
+def policies_of(points: pd.DataFrame) -> dict[str, str]:
     """Return the words of the policies with their names, in the order of the titles."""
-    found = {point.policy_label: point.policy for point in points}
+    found = dict(zip(points["policy_label"], points["policy"], strict=True))
     return dict(sorted(found.items(), key=lambda one: (policy_rank(one[1]), len(one[0]), one[0])))
 
 
-def learners_of(points: Points) -> tuple[str, ...]:
-    """Return the words of the learners by name."""
-    return tuple(sorted({point.learner_label for point in points}))
-
-
-def tabulate_points(points: Points) -> pd.DataFrame:
+def tabulate_points(points: pd.DataFrame) -> pd.DataFrame:
     """Return what is drawn, one row for each environment and configuration."""
-    table = pd.DataFrame([asdict(point) for point in points])
-    return table.drop(columns=["unit", "n_finished", "counts", "limit_us"])
+    return points.drop(columns=["unit", "counts", "limit_us", "known"])
 
 
-Numbers = tuple[DivergenceRule, Points]
+Numbers = tuple[DivergenceRule, pd.DataFrame]
 
 
-def draw(points: Points) -> Figure:
+def draw(points: pd.DataFrame) -> Figure:
     """Draw a panel for each environment, with a legend of policies and learners below all."""
-    environments = list(dict.fromkeys(point.env for point in points))
+    parts = [part for _, part in points.groupby("env", sort=False)]
     colours = policy_colours(policies_of(points))
-    markers = dict(zip(learners_of(points), itertools.cycle(MARKERS), strict=False))
+    markers = dict(zip(sorted(set(points["learner_label"])), itertools.cycle(MARKERS)))
     handles = _handles(points, colours, markers)
-    rows, columns = rows_and_columns(len(environments), 2)
+    rows, columns = rows_and_columns(len(parts), 2)
     legend = LEGEND_ROW * math.ceil(len(handles) / LEGEND_COLUMNS)
     figure, panels = sheet(rows, columns, PANEL_HEIGHT, legend)
-    for axes, env in zip(panels.flat, environments, strict=False):
-        _panel(axes, [point for point in points if point.env == env], colours, markers)
-    for axes in panels.flat[len(environments) :]:
+    for axes, part in zip(panels.flat, parts, strict=False):
+        _panel(axes, part, colours, markers)
+    for axes in panels.flat[len(parts) :]:
         axes.remove()
     legend_below(figure, LEGEND_COLUMNS, handles=handles, fontsize=6.5, handlelength=1.2)
     return figure
@@ -282,24 +219,24 @@ def policy_colours(policies: Mapping[str, str]) -> dict[str, str]:
 
 
 def _panel(
-    axes: Axes, points: Sequence[Point], colours: Mapping[str, str], markers: Mapping[str, str]
+    axes: Axes, points: pd.DataFrame, colours: Mapping[str, str], markers: Mapping[str, str]
 ) -> None:
-    known = [point for point in points if point.known]
-    front = [point for point in known if point.on_front]
-    for point in known:
-        _dot(axes, point, colours[point.policy_label], markers[point.learner_label])
+    known = points[points["known"]]
+    for point in known.itertuples():
+        _dot(axes, point, colours[str(point.policy_label)], markers[str(point.learner_label)])
     _limits(axes, known)
-    if front:  # as steps
-        times, losses = [one.us_per_step for one in front], [one.loss for one in front]
+    front = known[known["on_front"]]
+    if len(front):  # as steps
+        times, losses = front["us_per_step"].tolist(), front["loss"].tolist()
         steps = ([times[0], *times, axes.get_xlim()[1]], [axes.get_ylim()[1], *losses, losses[-1]])
         axes.plot(*steps, drawstyle="steps-post", color=BLACK, lw=0.7, zorder=2)
-    usual = _counts(points).partition(";")[0]
-    axes.set_title(f"{environment_title(points[0].env)} ({usual}, {len(points)} configurations)")
+    usual, env = _counts(points).partition(";")[0], points["env"].iloc[0]
+    axes.set_title(f"{environment_title(env)} ({usual}, {len(points)} configurations)")
     axes.set_xlabel("planning and learning in a step [µs]")
-    axes.set_ylabel(f"final {loss_label('loss', points[0].unit)}")
+    axes.set_ylabel(f"final {loss_label('loss', points['unit'].iloc[0])}")
 
 
-def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
+def _dot(axes: Axes, point: Any, colour: str, marker: str) -> None:
     ends = half_widths([point.loss], [point.low], [point.high])
     face = "white" if point.n_diverged else colour
     axes.errorbar(
@@ -309,14 +246,12 @@ def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
     )  # fmt: skip
 
 
-def _limits(axes: Axes, known: Sequence[Point]) -> None:
+def _limits(axes: Axes, known: pd.DataFrame) -> None:
     """Set logarithmic axes around all points, and mark the time between two steps."""
-    times = np.array([point.us_per_step for point in known])
-    ends = [(one.loss, one.low, one.high) for one in known]
-    left, right = log_limits(times, margin=1.6)
+    left, right = log_limits(known["us_per_step"].to_numpy(), margin=1.6)
     log_scale(axes, left, right, "x")
-    log_scale(axes, *log_limits(np.array(ends).ravel(), margin=1.3))
-    limit = known[0].limit_us if known else math.nan
+    log_scale(axes, *log_limits(known[["loss", "low", "high"]].to_numpy().ravel(), margin=1.3))
+    limit = known["limit_us"].iloc[0] if len(known) else math.nan
     if left < limit < right:
         axes.axvline(limit, **GUIDE)
         axes.annotate(
@@ -327,27 +262,25 @@ def _limits(axes: Axes, known: Sequence[Point]) -> None:
 
 
 def _handles(
-    points: Points, colours: Mapping[str, str], markers: Mapping[str, str]
+    points: pd.DataFrame, colours: Mapping[str, str], markers: Mapping[str, str]
 ) -> list[Line2D]:
-    handles = [
-        Line2D([], [], ls="", marker="o", ms=4, color=colour, label=words)
-        for words, colour in colours.items()
+    dots: list[tuple[str, dict[str, Any]]] = [
+        ("o", {"color": colour, "label": words}) for words, colour in colours.items()
     ]
-    handles += [
-        Line2D([], [], ls="", marker=marker, ms=4, color=GREY, label=words)
-        for words, marker in markers.items()
-    ]
-    if any(point.known and point.n_diverged for point in points):
-        handles.append(Line2D([], [], ls="", marker="o", ms=4, color=GREY, mfc="white",
-                              label="some trials diverged"))  # fmt: skip
-    handles.append(Line2D([], [], color=BLACK, lw=0.7, label="Pareto front"))
-    return handles
+    dots += [(marker, {"color": GREY, "label": words}) for words, marker in markers.items()]
+    if (points["known"] & (points["n_diverged"] > 0)).any():
+        dots.append(("o", {"color": GREY, "mfc": "white", "label": "some trials diverged"}))
+    handles = [Line2D([], [], ls="", marker=marker, ms=4, **look) for marker, look in dots]
+    return [*handles, Line2D([], [], color=BLACK, lw=0.7, label="Pareto front")]
 
 
 def caption(numbers: Numbers) -> str:
     """Return the caption, with what a point is, n and the configurations without a point."""
     rule, points = numbers
-    counts = text_by_environment(points, _counts)
+    counts = "; ".join(
+        f"{environment_title(str(env))}: {_counts(part)}"
+        for env, part in points.groupby("env", sort=False)
+    )
     return (
         "Root mean square error of the model over the evaluation grid after the last step, against "
         "the time that planning and learning take in a step, both on logarithmic axes. A point is "
@@ -361,15 +294,18 @@ def caption(numbers: Numbers) -> str:
     )
 
 
-def _counts(points: Sequence[Point]) -> str:
-    return count_text({one.label: one.counts for one in points if one.known})
+def _counts(points: pd.DataFrame) -> str:
+    known = points[points["known"]]
+    return count_text(dict(zip(known["label"], known["counts"], strict=True)))
 
 
-def _missing(points: Points) -> str:
+def _missing(points: pd.DataFrame) -> str:
     """Return which configurations have no point, or nothing."""
-    lost = [f"{environment_title(one.env)}, {one.label} ({one.counts})"
-            for one in points if not one.known]  # fmt: skip
-    return f"No point, as no trial has a positive final loss: {'; '.join(lost)}. " if lost else ""
+    lost = "; ".join(
+        f"{environment_title(str(one.env))}, {one.label} ({one.counts})"
+        for one in points[~points["known"]].itertuples()
+    )
+    return f"No point, as no trial has a positive final loss: {lost}. " if lost else ""
 
 
 PARETO: Plot[Numbers] = Plot(

@@ -35,7 +35,6 @@ from analysis.figures.panels import (
 )
 from analysis.stats.curves import (
     DrawnPlane,
-    Spectrum,
     average_spectrum,
     mean,
     median_seed,
@@ -278,20 +277,14 @@ INNER = slice(1, -1)
 
 
 @dataclass(frozen=True)
-class PolicySpectrum:
-    """Spectrum over the trials of a policy that did not diverge."""
-
-    policy: str
-    spectrum: Spectrum
-    n_diverged: int
-
-
-@dataclass(frozen=True)
 class InputSpectra:
     """Spectra of one environment.
 
     Attributes
     ----------
+    table : pandas.DataFrame
+        What is drawn, over the trials of a policy that did not diverge: one row for each policy
+        and frequency.
     eigenfrequency : float or None
         Of the linearised system at the stable equilibrium, damping included [Hz].
     gamma : float
@@ -303,11 +296,16 @@ class InputSpectra:
     """
 
     env: str
-    policies: tuple[PolicySpectrum, ...]
+    table: pd.DataFrame
     eigenfrequency: float | None
     gamma: float
     unit: str
     diverged: tuple[str, ...] = ()
+
+    @property
+    def by_policy(self) -> dict[str, pd.DataFrame]:
+        """The rows of each policy."""
+        return {str(name): rows for name, rows in self.table.groupby("policy", sort=False)}
 
 
 def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpectra:
@@ -315,54 +313,37 @@ def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpec
     entries = selection.of(env)
     system = system_of(entries[0].config.config)
     mode = eigenmode(system)
-    spectra = (_spectrum(reader, entry, system.dt) for entry in entries)
-    found = tuple(spectrum for spectrum in spectra if spectrum is not None)
-    if not found:
+    tables = [_spectrum(reader, entry, system.dt) for entry in entries if entry.final_losses()]
+    if not tables:
         raise AnalysisError(
             f"A spectrum of the inputs needs a finished trial, but {env} has none: run the grid."
         )
-    drawn = {spectrum.policy for spectrum in found}
     return InputSpectra(
         env=env,
-        policies=found,
+        table=pd.concat(tables, ignore_index=True),
         eigenfrequency=mode.frequency / (2 * math.pi) if mode else None,
         gamma=system.gamma,
         unit=unit_of(system.input_labels[0], ""),
         diverged=tuple(
-            one.config.policy for one in entries if one.finished and one.config.policy not in drawn
+            one.config.policy for one in entries if one.finished and not one.final_losses()
         ),
     )
 
 
-def _spectrum(reader: Reader, entry: Entry, dt: float) -> PolicySpectrum | None:
-    done = [trial.seed for trial in entry.trials if trial.status == "done"]
-    if not done:
-        return None
-    inputs = np.stack([reader.trajectory(entry.config.config_key, seed).inputs for seed in done])
-    diverged = len(entry.finished) - len(done)
-    return PolicySpectrum(entry.config.policy, average_spectrum(inputs, dt), diverged)
-
-
-def tabulate_spectra(spectra: InputSpectra) -> pd.DataFrame:
-    """Return what is drawn, one row for each policy and frequency."""
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "env": spectra.env,
-                    "policy": one.policy,
-                    "frequency_hz": one.spectrum.frequency,
-                    "mean": one.spectrum.mean,
-                    "quantile_10": one.spectrum.low,
-                    "quantile_90": one.spectrum.high,
-                    "n": one.spectrum.n,
-                    "n_diverged": one.n_diverged,
-                }
-            )
-            for one in spectra.policies
-        ],
-        ignore_index=True,
-    )
+def _spectrum(reader: Reader, entry: Entry, dt: float) -> pd.DataFrame:
+    key, done = entry.config.config_key, entry.final_losses()
+    found = average_spectrum(np.stack([reader.trajectory(key, seed).inputs for seed in done]), dt)
+    columns = {
+        "env": entry.config.env,
+        "policy": entry.config.policy,
+        "frequency_hz": found.frequency,
+        "mean": found.mean,
+        "quantile_10": found.low,
+        "quantile_90": found.high,
+        "n": found.n,
+        "n_diverged": len(entry.finished) - len(done),
+    }
+    return pd.DataFrame(columns)
 
 
 def spectrum_plot(env: str) -> Plot[InputSpectra]:
@@ -373,7 +354,7 @@ def spectrum_plot(env: str) -> Plot[InputSpectra]:
         band="10 % to 90 % quantiles over trials of the D-optimal density",
         part=lambda selection, _: selection.only([env], SHOWN).compared(),
         measure=lambda reader, selection, _: measure_spectra(reader, selection, env),
-        tabulate=tabulate_spectra,
+        tabulate=lambda spectra: spectra.table,
         draw=draw_spectra,
         caption=spectrum_caption,
     )
@@ -382,11 +363,12 @@ def spectrum_plot(env: str) -> Plot[InputSpectra]:
 def draw_spectra(spectra: InputSpectra) -> Figure:
     """Draw all spectra on logarithmic axes, between the zero and the Nyquist frequency."""
     figure, [[axes]] = sheet(1, 1, HEIGHT, width=COLUMN_WIDTH)
-    for one in reversed(spectra.policies):
-        _line(axes, one)
-    log_scale(axes, *_spectrum_limits(spectra))
-    frequency = spectra.policies[0].spectrum.frequency
-    log_scale(axes, frequency[1], frequency[-2], "x")
+    found = {name: rows[INNER] for name, rows in spectra.by_policy.items()}
+    for name, rows in reversed(found.items()):
+        _line(axes, name, rows)
+    log_scale(axes, *_spectrum_limits(pd.concat(found.values())))
+    frequency = next(iter(found.values()))["frequency_hz"]
+    log_scale(axes, frequency.iloc[0], frequency.iloc[-1], "x")
     axes.set_xlabel("frequency [Hz]")
     unit = f"({spectra.unit})" if " " in spectra.unit else spectra.unit
     axes.set_ylabel(f"power spectral density of u [{unit}²/Hz]")
@@ -396,23 +378,21 @@ def draw_spectra(spectra: InputSpectra) -> Figure:
     return figure
 
 
-def _line(axes: Axes, one: PolicySpectrum) -> None:
-    style, spectrum = policy_style(one.policy), one.spectrum
-    colour = GREYS.get(one.policy, style.colour)
-    label = f"{style.label}, mean (n = {but_diverged(spectrum.n, one.n_diverged)})"
-    f = spectrum.frequency[INNER]
-    if one.policy == REFERENCE:
-        ends = f, spectrum.low[INNER], spectrum.high[INNER]
-        label_of_band = f"{style.label}, 10–90 % of trials"
-        axes.fill_between(*ends, color=colour, alpha=0.2, lw=0, label=label_of_band)
-    axes.plot(f, spectrum.mean[INNER], color=colour, ls=style.line, lw=style.width, label=label)
+def _line(axes: Axes, policy: str, rows: pd.DataFrame) -> None:
+    style = policy_style(policy)
+    colour, f = GREYS.get(policy, style.colour), rows["frequency_hz"]
+    counts = but_diverged(*rows[["n", "n_diverged"]].iloc[0])
+    if policy == REFERENCE:
+        label = f"{style.label}, 10–90 % of trials"
+        ends = rows["quantile_10"], rows["quantile_90"]
+        axes.fill_between(f, *ends, color=colour, alpha=0.2, lw=0, label=label)
+    label = f"{style.label}, mean (n = {counts})"
+    axes.plot(f, rows["mean"], color=colour, ls=style.line, lw=style.width, label=label)
 
 
-def _spectrum_limits(spectra: InputSpectra) -> tuple[float, float]:
+def _spectrum_limits(rows: pd.DataFrame) -> tuple[float, float]:
     """Return limits over everything but leakage more than DECADES below the peak."""
-    values = np.concatenate(
-        [np.r_[one.spectrum.mean[INNER], one.spectrum.high[INNER]] for one in spectra.policies]
-    )
+    values = rows[["mean", "quantile_90"]].to_numpy()
     top = float(values.max()) or 1.0
     usable = values[values > top * 10.0**-DECADES]
     return float(usable.min() if len(usable) else top / 10) / 2, top * 3
@@ -439,16 +419,14 @@ def spectrum_caption(spectra: InputSpectra) -> str:
         )
     if spectra.diverged:
         lines += f" Not drawn, because every trial diverged: {', '.join(spectra.diverged)}."
-    counts = count_text({one.policy: str(one.spectrum.n) for one in spectra.policies})
+    found = spectra.by_policy
+    counts = count_text({name: str(rows["n"].iloc[0]) for name, rows in found.items()})
+    grey = " and ".join(name for name in found if name in GREYS)
+    grey += " in grey; " if grey else ""
     return (
         f"Power spectral density of the inputs in the {environment_title(spectra.env)}: one-sided "
         f"periodogram of every trial (boxcar window, no detrending; its integral is the mean "
         f"square of the input; γ² = {spectra.gamma**2:g}), mean over trials; band: 10 % to "
-        f"90 % quantiles over D-optimal trials; {_in_grey(spectra)}zero and Nyquist frequency not "
+        f"90 % quantiles over D-optimal trials; {grey}zero and Nyquist frequency not "
         f"drawn.{lines} Trials: {counts}."
     )
-
-
-def _in_grey(spectra: InputSpectra) -> str:
-    names = [one.policy for one in spectra.policies if one.policy in GREYS]
-    return f"{' and '.join(names)} in grey; " if names else ""

@@ -101,7 +101,7 @@ def create_app(url: str, host: str = "127.0.0.1") -> Starlette:
             *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
             *(Route(path, partial(_ask, state, to), methods=["POST"]) for path, to in STATEMENTS),
             Route("/api/curves.csv", partial(_curves_table, state)),
-            Route("/api/events", partial(_events, state)),
+            Route("/api/events", state.events.respond),
         ],
         middleware=[Middleware(SecurityMiddleware, host=host)],
         exception_handlers={
@@ -172,10 +172,6 @@ STATEMENTS: tuple[tuple[str, Answer], ...] = (
     ("/api/sql", lambda state, at, *ask: _data(state, lambda *_: sql.rows(state, *ask), at)),
     ("/api/sql.csv", lambda state, _, *ask: as_csv(sql.table(state, *ask), "sql")),
 )
-
-
-async def _events(state: ServerState, request: Request) -> Response:
-    return state.events.respond(request)
 
 
 def _curves_table(state: ServerState, request: Request) -> Response:
@@ -337,16 +333,8 @@ def is_own(hosts: list[str], listening: str) -> bool:
 
 def _name(host: str) -> str | None:
     """Return the Host header without its port and brackets; None where it is malformed."""
-    if host.startswith("["):
-        name, bracket, port = host[1:].partition("]")
-        if not bracket or (port and not port.startswith(":")):
-            return None
-        port = port[1:]
-    else:
-        name, _, port = host.partition(":")
-    if port and not (port.isascii() and port.isdigit()):
-        return None
-    return name.lower() or None
+    found = re.fullmatch(r"(?:\[([^\]]*)\]|([^:\[]*))(?::[0-9]*)?", host)
+    return ((found[1] or found[2] or "").lower() or None) if found else None
 
 
 class Connection(H11Protocol):

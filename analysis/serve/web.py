@@ -11,6 +11,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from decimal import Decimal
@@ -319,72 +320,52 @@ def read_progress(reader: Reader) -> dict[str, Any]:
     }
 
 
-@dataclass
 class Events:
     """Progress of the database, read once a second for all streams together while one is open."""
 
-    database: Database
-    _latest: str = ""
-    _n_open: int = 0
-    ended: bool = False
-    _reading: asyncio.Task[None] | None = None
-    _changed: asyncio.Event = field(default_factory=asyncio.Event)
+    def __init__(self, database: Database) -> None:
+        self.database = database
+        self._latest = ""
+        self._due = 0.0
+        self._reading = asyncio.Lock()
+        self._end = asyncio.Event()
 
-    async def stream(self) -> AsyncIterator[str]:
-        """Yield the progress, and again after every change, until the server ends."""
-        self._n_open += 1
-        if self._reading is None:
-            self._reading = asyncio.create_task(self._read())
-        try:
-            sent = ""
-            while not self.ended:
-                if self._latest == sent and not await self._change():
-                    yield COMMENT
-                elif self._latest != sent:
-                    sent = self._latest
-                    yield sent
-        finally:
-            self._n_open -= 1
-            if not self._n_open:
-                self._reading.cancel()
-                self._reading, self._latest = None, ""
+    @property
+    def ended(self) -> bool:
+        """Whether the server ends."""
+        return self._end.is_set()
 
     def end(self) -> None:
         """End all streams, now and later."""
-        self.ended = True
-        self._tell()
+        self._end.set()
 
-    def respond(self, request: Request) -> Response:
+    async def respond(self, request: Request) -> Response:
         """Return the stream."""
         if request.method == "HEAD":
             return Response(media_type=MEDIA_TYPE)
         return StreamingResponse(self.stream(), media_type=MEDIA_TYPE)
 
-    async def _change(self) -> bool:
-        """Wait for the next change; return whether it came. Raises what the reading raised."""
-        assert self._reading
-        change = asyncio.ensure_future(self._changed.wait())
-        done, _ = await asyncio.wait(
-            [change, self._reading], timeout=SILENCE, return_when=asyncio.FIRST_COMPLETED
-        )
-        change.cancel()
-        if self._reading in done:
-            await self._reading
-        return bool(done)
+    async def stream(self) -> AsyncIterator[str]:
+        """Yield the progress, and again after every change, until the server ends."""
+        sent, said = "", 0.0
+        while not self.ended:
+            latest, now = await self._read(), time.monotonic()
+            if latest != sent or now - said >= SILENCE:
+                yield COMMENT if latest == sent else latest
+                sent, said = latest, now
+            with suppress(TimeoutError):
+                wait = min(self._due - time.monotonic(), SILENCE)
+                await asyncio.wait_for(self._end.wait(), max(wait, 0.0))
 
-    async def _read(self) -> None:
-        while True:
+    async def _read(self) -> str:
+        """Return the newest event; the first stream that asks after a while reads it for all."""
+        async with self._reading:
             start = time.monotonic()
-            latest = await asyncio.to_thread(self._event)
-            if latest != self._latest:
-                self._latest = latest
-                self._tell()
-            await asyncio.sleep(max(PERIOD, 10 * (time.monotonic() - start)))
-
-    def _tell(self) -> None:
-        """Wake all streams."""
-        self._changed.set()
-        self._changed = asyncio.Event()
+            if start >= self._due:
+                self._latest = await asyncio.to_thread(self._event)
+                now = time.monotonic()
+                self._due = now + max(PERIOD, 10 * (now - start))
+            return self._latest
 
     def _event(self) -> str:
         """Return the event ``progress``, or ``unavailable`` for a database that has none."""

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -254,8 +254,7 @@ def _weights(n: int, place: int) -> Array:
     return np.asarray(rng.multinomial(n, np.full(n, 1 / n), size=MEAN_RESAMPLES) / n)
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """A geometric mean over trials with its 95 % interval, NaN for fewer than two."""
 
     value: float
@@ -469,19 +468,15 @@ def wrapped_line(line: Array, axis: int, centre: float = 0.0) -> Array:
     edge, a row of NaN breaks it, and it goes on from the opposite edge. A step of more than one
     turn is a break without edges: between the two samples nothing is known.
     """
-    count = turns(line[:, axis], centre)
-    pieces = [_wrapped(line[:1], axis, centre)]
-    for before, after, jump in zip(line[:-1], line[1:], np.diff(count), strict=True):
-        if jump:
-            pieces.append(_crossing(before, after, axis, centre, jump))
-        pieces.append(_wrapped(after[None], axis, centre))
-    return np.concatenate(pieces)
-
-
-def _wrapped(line: Array, axis: int, centre: float) -> Array:
-    inside = line.copy()
+    count, inside = turns(line[:, axis], centre), line.copy()
     inside[:, axis] = wrap(line[:, axis], centre)
-    return inside
+    jumps = np.diff(count)
+    places = np.flatnonzero(jumps)
+    pieces = np.split(inside, places + 1)
+    for i, place in enumerate(places):
+        edges = _crossing(line[place], line[place + 1], axis, centre, jumps[place])
+        pieces[i] = np.concatenate([pieces[i], edges])
+    return np.concatenate(pieces)
 
 
 def _crossing(before: Array, after: Array, axis: int, centre: float, jump: float) -> Array:

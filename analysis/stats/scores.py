@@ -78,27 +78,6 @@ def mean_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule)
     return _scores(reader, entry, column, rule, mean_over_steps)
 
 
-def steps_to(
-    reader: Reader, entry: Entry, column: str, rule: DivergenceRule, threshold: float
-) -> Scores:
-    """Return the steps until the loss first is at most the threshold, inf where it never is."""
-    return _scores(reader, entry, column, rule, lambda values: first_passage(values, threshold))
-
-
-def lasting_steps(
-    reader: Reader, entry: Entry, column: str, rule: DivergenceRule, threshold: float
-) -> Scores:
-    """Return the steps until the loss stays at most the threshold, inf where it does not."""
-    return _scores(reader, entry, column, rule, lambda values: last_passage(values, threshold))
-
-
-def mean_over_steps(values: Array) -> Array:
-    """Return exp of the mean logarithm along the steps of losses (n, T); 0 where one of them is."""
-    with np.errstate(divide="ignore"):
-        found: Array = np.exp(np.mean(np.log(values), axis=1))
-    return found
-
-
 def first_passage(values: Array, threshold: float) -> Array:
     """Return the number of inputs until a curve of (n, T) first is at most the threshold.
 
@@ -117,6 +96,28 @@ def last_passage(values: Array, threshold: float) -> Array:
     n_steps = values.shape[1]
     last = np.where(above.any(axis=1), n_steps - above[:, ::-1].argmax(axis=1), 0)
     return np.where(last < n_steps, last + 1.0, np.inf)
+
+
+def steps_to(
+    reader: Reader,
+    entry: Entry,
+    column: str,
+    rule: DivergenceRule,
+    threshold: float,
+    passage: Callable[[Array, float], Array] = first_passage,
+) -> Scores:
+    """Return the steps until the loss is at most the threshold, inf where it never is.
+
+    By default for the first time (:func:`first_passage`).
+    """
+    return _scores(reader, entry, column, rule, lambda values: passage(values, threshold))
+
+
+def mean_over_steps(values: Array) -> Array:
+    """Return exp of the mean logarithm along the steps of losses (n, T); 0 where one of them is."""
+    with np.errstate(divide="ignore"):
+        found: Array = np.exp(np.mean(np.log(values), axis=1))
+    return found
 
 
 def _scores(
@@ -299,42 +300,22 @@ Interval = tuple[float, float, float]
 """Centre, low and high."""
 
 
-@dataclass(frozen=True)
-class TrueModel:
-    """Success of the planner with the true model in an environment: the ceiling of the others.
-
-    ``n`` seeds, the share of successes with its Wilson interval of 95 %, and how many of the
-    episodes have no finite cost. NaN without seeds.
-    """
-
-    n: int
-    success: float
-    success_low: float
-    success_high: float
-    lost: int
-
-
 def control_part(selection: Selection) -> Selection:
     """Return the entries with a task, in each environment the task with most trials."""
     asked = [entry for entry in selection.stored if task_of(entry)]
     chosen: list[Entry] = []
     for env in dict.fromkeys(entry.config.env for entry in asked):
-        chosen += _of_one_task(
-            [entry for entry in asked if entry.config.env == env], selection.reference
-        )
+        own = [entry for entry in asked if entry.config.env == env]
+        most = common_task(own)
+        same = {entry.config.config_key: entry for entry in own if task_of(entry) == most}
+        configs = choose((entry.config for entry in same.values()), selection.reference)
+        chosen += [same[config.config_key] for config in configs]
     chosen.sort(key=lambda e: (environment_rank(e.config.env), policy_rank(e.config.policy)))
     entries = tuple(labelled(chosen))
     notes = unfinished(
         chosen, lambda one: f"{one.env} × {one.policy}", "trials with a task not finished"
     )
     return replace(selection, entries=entries, gaps=(), notes=tuple(notes), stored=entries)
-
-
-def _of_one_task(entries: list[Entry], reference: str) -> list[Entry]:
-    most = common_task(entries)
-    same = {entry.config.config_key: entry for entry in entries if task_of(entry) == most}
-    chosen = choose((entry.config for entry in same.values()), reference)
-    return [same[config.config_key] for config in chosen]
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:
@@ -368,10 +349,13 @@ def measured(reader: Reader, entry: Entry, *measures: str) -> list[Assessments]:
     ]
 
 
-def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
+def true_model(reader: Reader, entries: Iterable[Entry]) -> dict[str, float]:
     """Return what the true model achieved on the seeds of some entries, each seed once.
 
-    Trials of one seed, environment and task share that episode.
+    Trials of one seed, environment and task share that episode: it is the ceiling of the others.
+    ``n`` seeds, the share of successes with its Wilson interval of 95 %, ``success``,
+    ``success_low`` and ``success_high``, and how many of the episodes have no finite cost,
+    ``lost``. NaN without seeds.
     """
     successes: dict[int, float] = {}
     costs: dict[int, float] = {}
@@ -382,9 +366,13 @@ def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
                 total.update(_first(found))
     known = [seed for seed, success in successes.items() if np.isfinite(success)]
     finite = usable(np.array([costs.get(seed, np.nan) for seed in known]))
-    return TrueModel(
-        len(known), *success_rate(np.array(list(successes.values()))), int(np.sum(~finite))
-    )
+    shares = success_rate(np.array(list(successes.values())))
+    columns = ("success", "success_low", "success_high")
+    return {
+        "n": len(known),
+        **dict(zip(columns, shares, strict=True)),
+        "lost": int(np.sum(~finite)),
+    }
 
 
 def _first(found: Assessments) -> dict[int, float]:

@@ -21,7 +21,7 @@ import pandas as pd
 from analysis.data.matching import AnalysisError, nearness
 from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
-from analysis.stats.curves import Statistic, centre, mean_columns, stratified_mean
+from analysis.stats.curves import Statistic, centre, mean, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
     Measure,
@@ -175,8 +175,7 @@ def _successes(reader: Reader, entry: Entry, t: int) -> float:
     """Return the share of successful episodes after t explored steps, NaN for none."""
     found = reader.assessments(entry.config.config_key, "control_success")
     known = found.values[:, found.t == t]
-    known = known[np.isfinite(known)]
-    return float(np.mean(known)) if len(known) else math.nan
+    return float(mean(known[np.isfinite(known)]))
 
 
 def references(selection: Selection, env: str) -> Iterator[tuple[Entry, Entry, bool]]:

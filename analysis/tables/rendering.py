@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -45,8 +45,8 @@ from orchestrate.store import QueryError, Reader
 _ESCAPED = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _ESCAPED |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
 _ESCAPED |= {"<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}"}
-_SIGNS = {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
-_SIGNS |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
+_ESCAPED |= {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
+_ESCAPED |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
 
 _JUDGED = {
     Measure.FINAL: "final loss",
@@ -55,7 +55,6 @@ _JUDGED = {
 
 _RATIO = "variant / reference, below 1 the variant is better"
 _TESTED = "then adjusted over the table (Benjamini-Hochberg)"
-_DEFAULT = PlotOptions()
 CALIBRATION_HELP = "fit at held-out states, coverage of their intervals, energy of the inputs"
 SETS = ("grid", "reachable")
 
@@ -92,8 +91,8 @@ def _latex_text(text: object) -> str:
 
 
 def _latex_letter(letter: str) -> str:
-    if letter in _ESCAPED or letter in _SIGNS:
-        return _ESCAPED.get(letter) or _SIGNS[letter]
+    if letter in _ESCAPED:
+        return _ESCAPED[letter]
     name = unicodedata.name(letter, "")
     if name.startswith("GREEK SMALL LETTER "):
         return rf"$\{name.rpartition(' ')[2].lower().replace('lamda', 'lambda')}$"
@@ -102,14 +101,11 @@ def _latex_letter(letter: str) -> str:
 
 def _ascii(text: str) -> str:
     """Return the nearest ASCII text, letters without one as their names, no combining marks."""
-    return "".join(map(_ascii_letter, unicodedata.normalize("NFKD", text)))
-
-
-def _ascii_letter(letter: str) -> str:
-    if letter.isascii():
-        return letter
-    name = unicodedata.name(letter, "?").lower()
-    return "" if unicodedata.combining(letter) else name.rpartition(" ")[2]
+    return "".join(
+        letter if letter.isascii() else unicodedata.name(letter, "?").lower().rpartition(" ")[2]
+        for letter in unicodedata.normalize("NFKD", text)
+        if not unicodedata.combining(letter)
+    )
 
 
 Row = Mapping[str, Any]
@@ -298,18 +294,12 @@ def incomplete(gaps: Sequence[Gap], wanted: str, options: str) -> IncompleteErro
     )
 
 
-class Part(Protocol):
-    """Cuts a selection down to what a table shows."""
-
-    def __call__(self, selection: Selection, options: PlotOptions = ..., /) -> Selection: ...
-
-
 @dataclass(frozen=True)
 class TableKind:
     """A kind of table; ``part`` cuts the selection, without entries the table is not made."""
 
     title: str
-    part: Part
+    part: Callable[[Selection, PlotOptions], Selection]
     measure: Callable[[Reader, Selection, PlotOptions], pd.DataFrame]
     render: Callable[[pd.DataFrame, PlotOptions], TextTable]
 
@@ -337,18 +327,18 @@ def comparison(column: str, measure: Measure) -> TableKind:
     )
 
 
-def _whole(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+def _whole(selection: Selection, _: PlotOptions) -> Selection:
     return selection
 
 
-def _compared(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+def _compared(selection: Selection, _: PlotOptions) -> Selection:
     compared = selection.simulated().compared()
     return compared if len(compared.labels) > 1 else Selection(())
 
 
-def _raced(selection: Selection, options: PlotOptions = _DEFAULT) -> Selection:
+def _raced(selection: Selection, options: PlotOptions) -> Selection:
     """Return the environments that have the yardstick's trials too, if these give the loss."""
-    compared = _compared(selection)
+    compared = _compared(selection, options)
     if options.epsilon is not None:
         return compared
     return compared.only(
@@ -358,7 +348,7 @@ def _raced(selection: Selection, options: PlotOptions = _DEFAULT) -> Selection:
     )
 
 
-def _controlled(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+def _controlled(selection: Selection, _: PlotOptions) -> Selection:
     """Return the environments with a task in which the reference and a variant were assessed."""
     controlled = control_part(selection).compared()
     return controlled if len(controlled.labels) > 1 else Selection(())
@@ -555,7 +545,7 @@ def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
     )
     return TableKind(
         "Final losses beside sample losses",
-        lambda selection, *_: selection,
+        _whole,
         lambda reader, selection, _: measure_sample_losses(reader, selection, say, keep),
         lambda table, _: rendered(table, columns, SAMPLE_LOSS_NOTE),
     )

@@ -35,21 +35,21 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.stats.curves import mean_columns
+from analysis.stats.curves import mean, mean_columns
 from analysis.stats.scores import (
-    TrueModel,
     benjamini_hochberg,
     censored_median,
     common_task,
     compare_hitting_times,
     final_losses,
     geometric_mean,
-    lasting_steps,
+    last_passage,
     mcnemar,
     mean_losses,
     measured,
     relative_costs,
     scores_at,
+    steps_to,
     success_rate,
     task_of,
     true_model,
@@ -186,8 +186,7 @@ def _of_unequal_seeds(variants: Sequence[Entry]) -> Iterator[str]:
     numbers = Counter(len({trial.seed for trial in one.trials}) for one in variants)
     if len(numbers) > 1:
         counts = ", ".join(
-            f"{n} seeds: {count} variant{'s' if count > 1 else ''}"
-            for n, count in sorted(numbers.items())
+            f"{n} seeds: {count} variant{'s' * (count > 1)}" for n, count in sorted(numbers.items())
         )
         yield f"{counts}; a ratio is over the seeds that both variants of it have"
 
@@ -268,7 +267,7 @@ def _scores(
             "auc": mean_losses(reader, one, "loss", rule).by_seed,
             "coverage": coverages(reader, one, plane),
             "control": scores_at(reader, one, first).by_seed if one.label in assessed else {},
-            "steps": lasting_steps(reader, one, "loss", rule, epsilon).by_seed,
+            "steps": steps_to(reader, one, "loss", rule, epsilon, last_passage).by_seed,
         }
         for one in group.variants
     }
@@ -329,10 +328,9 @@ def _against(
     own: ByMeasure, reference: ByMeasure, variant: Entry, measure: str, prefix: str = ""
 ) -> dict[str, float]:
     """Return the ratio to the reference; NaN for the reference itself."""
-    found = None
-    if own is not reference:
-        names = variant.config.env, variant.label, measure
-        found = against_reference(own[measure], reference[measure], *names)
+    names = variant.config.env, variant.label, measure
+    pair = own[measure], reference[measure]
+    found = None if own is reference else against_reference(*pair, *names)
     return {
         f"{prefix}{measure}_{name.removesuffix('_value')}": getattr(found, name, math.nan)
         for name in ("ratio", "low", "high", "improvement", "p_value")
@@ -387,15 +385,13 @@ def _control_rows(reader: Reader, group: VariantGroup) -> Iterator[dict[str, obj
     yield from (_truth(group.env, truth, t) for t in sorted(steps))
 
 
-def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
+def _truth(env: str, truth: Mapping[str, float], t: int) -> dict[str, object]:
     """Return a row of the true model: the same after any number of steps, its cost the unit."""
-    names = ("n", "success", "success_low", "success_high")
     return {
         **{"env": env, "variant": TRUTH, "t": t},
-        **{name: getattr(truth, name) for name in names},
-        "cost": 1.0 if truth.lost < truth.n else math.nan,
-        "lost": truth.lost,
-        "described": str(truth.n),
+        **truth,
+        "cost": 1.0 if truth["lost"] < truth["n"] else math.nan,
+        "described": str(truth["n"]),
     }
 
 
@@ -403,9 +399,7 @@ def _test(own: Assessments, reference: Assessments | None, t: int) -> float:
     """Return p of the successes after t explored steps, over the seeds that reached them."""
     if reference is None or own is reference or t == 0:
         return math.nan
-    ours, theirs = (_at(found, t) for found in (own, reference))
-    seeds = sorted(set(ours) & set(theirs))
-    return mcnemar(*(np.array([each[seed] for seed in seeds]) for each in (ours, theirs)))
+    return mcnemar(*paired(_at(own, t), _at(reference, t)))
 
 
 def _at(found: Assessments, t: int) -> dict[int, float]:
@@ -418,5 +412,4 @@ def _free_run(found: Assessments, t: int, reached: int) -> dict[str, object]:
     """Return the mean error after t steps, and of how many trials it is not finite."""
     errors = found.values[:, found.t == t]
     finite = errors[np.isfinite(errors)]
-    mean = float(np.mean(finite)) if len(finite) else math.nan
-    return {"free_run": mean, "free_run_lost": max(0, reached - len(finite))}
+    return {"free_run": float(mean(finite)), "free_run_lost": max(0, reached - len(finite))}

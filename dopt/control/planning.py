@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dopt.control.task import Control, Feedback, Goal
-from dopt.evaluation import evaluation_set
+from dopt.evaluation import evaluation_set, rates
 from dopt.policies.base import on_sphere
 from dopt.systems.base import System, next_state
 from dopt.types import Array
@@ -63,17 +63,9 @@ def _predict_in_stages(
     visited[0] = states
     with np.errstate(over="ignore", invalid="ignore"):
         for t in range(inputs.shape[1]):
-            rate = functools.partial(_rate, system, accelerations, inputs[:, t])
+            rate = functools.partial(rates, system, accelerations, inputs[:, t])
             visited[t + 1] = next_state(system.integrator, rate, visited[t], system.dt)
     return visited[1:]
-
-
-def _rate(system: System, accelerations: Accelerations, inputs: Array, states: Array) -> Array:
-    """Return dx/dt, (N, d), of states (N, d) under inputs (N, m)."""
-    known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
-    rate = np.stack(np.broadcast_arrays(*known, states[:, 0])[:-1], axis=-1)
-    rate[:, list(system.learned_rows)] += accelerations(states, inputs)
-    return rate
 
 
 # Cross-entropy planner: sample input sequences, keep the best, sample around them.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.fields import Validated, parameter
@@ -116,7 +116,8 @@ class Control(Validated):
                 f"{', '.join(f'task.{name}' for name in missing)} are not given: set them, or "
                 f"leave the task out with task=none."
             )
-        goal = Goal(**chosen) if own is None else dataclasses.replace(own, **_given(chosen))
+        given = {name: value for name, value in chosen.items() if value is not None}
+        goal = Goal(**chosen) if own is None else dataclasses.replace(own, **given)
         self._check(goal, system)
         return goal
 
@@ -174,10 +175,6 @@ class Goal:
 
 GOAL_FIELDS = tuple(field.name for field in dataclasses.fields(Goal))
 """Fields of a task that differ from system to system."""
-
-
-def _given(fields: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in fields.items() if value is not None}
 
 
 GOALS = {

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import TIMEOUT_MAX
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Self
 
 import numpy as np
@@ -21,7 +21,7 @@ from dopt.arguments import finite, instance, measured, numbers, safe_input, seco
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside, first_evidence, first_simulation
-from dopt.explorer.saving import SavedExplored
+from dopt.explorer.saving import Explored
 from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
 from dopt.learning import Conditioning, GaussNewton, Learner, SimulationError
 from dopt.models import Model
@@ -52,51 +52,17 @@ def uninterrupted() -> Iterator[None]:
             before(signal.SIGINT, pressed[0])
 
 
-# Count of states in a row from which nothing was learned, with one warning when they are many.
-
-
 MANY = 20
 """States in a row from which nothing was learned that are said."""
 
 _log = logging.getLogger("dopt.explorer")
 
 
-class UnlearnedStates:
-    """States since the last one that was learned from, by the events of an exploration.
-
-    Parameters
-    ----------
-    dt : float
-        Time from one state to the next that is expected [s].
-    """
-
-    def __init__(self, dt: float) -> None:
-        self._dt = dt
-        self._in_a_row = 0
-
-    def note(self, event: Event, counts: Mapping[str, int]) -> None:
-        """Count the state of an event; warn at the ``MANY``-th, with the counts of all states."""
-        if "learn" in event:
-            self._in_a_row = 0
-            return
-        if not event.keys().isdisjoint(("plan", "missed")) or event.get("lost") == "resets":
-            return
-        self._in_a_row += 1
-        if self._in_a_row == MANY:
-            _log.warning(
-                "nothing was learned from the last %d states (%s), but states are expected every "
-                "%g s: tell() each state that followed an input, give times in seconds, call "
-                "reset() if their clock restarted, and give a limit that no state is beyond, and "
-                "a policy and a learner that are faster than that",
-                *(MANY, counts, self._dt),
-            )
-
-
 STEPS = 20_000
 """Steps of an exploration unless it is told otherwise."""
 
 
-class Explorer(SavedExplored):
+class Explorer(Explored):
     """Explores a plant: chooses its inputs, and learns from the states that follow.
 
     >>> explorer = Explorer(plant, policy="d_optimal", journal="run.jsonl")
@@ -209,11 +175,12 @@ class Explorer(SavedExplored):
         )
         instance("journal", journal, str | Path | None, "the path of a file")
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
-        if _name_of(learner) == SimulationError.name:
+        named = getattr(learner, "name", learner)
+        named = learner.get("name") if isinstance(learner, Mapping) else named
+        if named == SimulationError.name:
             model = {"name": "mlp", "depth": 1} if model is None else model
-            plant = (
-                dataclasses.replace(plant, integrator="rk4") if isinstance(plant, Plant) else plant
-            )
+            if isinstance(plant, Plant):
+                plant = dataclasses.replace(plant, integrator="rk4")
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
         spec = TrialSpec.of_system(
             *(system, policy),
@@ -252,7 +219,7 @@ class Explorer(SavedExplored):
         self._limits[self._angles] = np.finfo(float).max
         super().__init__(spec)
         self._plans_each_step = may_remember_plans(spec)
-        self._unlearned = UnlearnedStates(spec.system.dt)
+        self._unlearned = 0  # states in a row from which nothing was learned
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
         self._planner = PunctualPlanner(self._state.plan, deadline)
         self._fits: FitBeside | None = None
@@ -384,8 +351,10 @@ class Explorer(SavedExplored):
         elif not np.isfinite(state.accelerations(x, u, elapsed)).all():
             self._note({"lost": "unusable"})
         else:
-            if state.answer is None:
-                self._plan_unasked()
+            if state.answer is None and self._plans_each_step:  # though none was asked for
+                if not self._planner.plan():
+                    self._planner.wait()
+                self._note_plan(unasked=True)
             if now is None and state.time is not None:
                 now = state.time + dt
             event = {"learn": x.tolist(), "applied": u.tolist(), "dt": elapsed, "time": now}
@@ -455,7 +424,18 @@ class Explorer(SavedExplored):
         if self._journal is not None:
             self._journal.write(event, durable=durable)
         self._state.do(event)
-        self._unlearned.note(event, self.counts)
+        if "learn" in event:
+            self._unlearned = 0
+        elif event.keys().isdisjoint(("plan", "missed")) and event.get("lost") != "resets":
+            self._unlearned += 1
+            if self._unlearned == MANY:
+                _log.warning(
+                    "nothing was learned from the last %d states (%s), but states are expected "
+                    "every %g s: tell() each state that followed an input, give times in seconds, "
+                    "call reset() if their clock restarted, and give a limit that no state is "
+                    "beyond, and a policy and a learner that are faster than that",
+                    *(MANY, self.counts, self.spec.system.dt),
+                )
 
     def _plan(self) -> None:
         """Plan for the present state; the fallback is the answer if that is not ready in time."""
@@ -463,13 +443,6 @@ class Explorer(SavedExplored):
             self._note_plan()
         if self._state.answer is None:
             self._note({"missed": self._fallback.tolist()}, durable=False)
-
-    def _plan_unasked(self) -> None:
-        """Let a policy that may remember its plans make one where none was asked for."""
-        if self._plans_each_step:
-            if not self._planner.plan():
-                self._planner.wait()
-            self._note_plan(unasked=True)
 
     def _note_plan(self, **more: bool) -> None:
         planned = self._state.planned
@@ -517,18 +490,8 @@ class Explorer(SavedExplored):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _name_of(part: object) -> object:
-    """Return the name of a section or an object, or the name itself."""
-    return part.get("name") if isinstance(part, Mapping) else getattr(part, "name", part)
 
 
 def _about(spec: TrialSpec) -> Event:

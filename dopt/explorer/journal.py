@@ -12,7 +12,6 @@ the line with which a program that writes them has gone on.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import json
 import math
@@ -122,7 +121,7 @@ class Journal:
                 os.fsync(self._file.fileno())
         except OSError as error:
             self._broken = True
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 self._file.truncate(self._size)  # half a line would hide what follows it
             raise ExplorationError(
                 f"the journal {self.path} could not be written ({error}), so that the exploration "
@@ -133,7 +132,7 @@ class Journal:
     def close(self) -> None:
         """Close the file, on the disk."""
         if not self._file.closed:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 os.fsync(self._file.fileno())
             self._file.close()
 
@@ -159,18 +158,13 @@ def _lock(file: int, path: Path) -> None:
     Exceptions that Numba has caught while it compiled refer to themselves, and through their frames
     to the explorer for which it did: without the collector of garbage it may stay for long.
     """
-    if not _locked(file):
+    if not lock_file(file, wait=False):
         gc.collect()
-        if not _locked(file):
+        if not lock_file(file, wait=False):
             raise SpecificationError(
                 f"the journal {path} is written by another explorer, here or in another process, "
                 f"but one at a time may do so: close() it, or give another file."
             )
-
-
-def _locked(file: int) -> bool:
-    """Lock a file, and return whether that was possible at once."""
-    return lock_file(file, wait=False)
 
 
 def _read(path: Path, beginning: bytes) -> tuple[int, int, list[dict[str, Any]]]:

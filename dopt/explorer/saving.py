@@ -106,7 +106,7 @@ def free_run_error(
     measured states.
     """
     system = spec.system if system is None else system
-    y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
+    y, u = np.atleast_1d(reals("states", states)), np.atleast_1d(reals("inputs", inputs))
     steps = whole("steps", steps)
     rows = _rows_of(system, y)
     first = 0 if isinstance(rows, slice) else max(steps, 1)  # in which the filter settles
@@ -117,7 +117,13 @@ def free_run_error(
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
-    x = y if isinstance(rows, slice) else _estimated(spec, system, predict, y, u, rows)
+    x = y
+    if not isinstance(rows, slice):
+        found, learner = scaled(system), spec.learner
+        learner = learner if isinstance(learner, JointKalman) else JointKalman()
+        run = found.of_states(y, rows), found.of_inputs(u)
+        by_model = found.scaled_predictions(predict)
+        x = found.states * filtered_states(found.system, by_model, *run, learner.noise_variance)
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
     starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
@@ -128,21 +134,6 @@ def free_run_error(
         )
     predicted = forecast_by(system, predict)(x[first:last:steps], cut)
     return relative_error(predicted[..., rows], ends, starts)
-
-
-def _estimated(
-    spec: TrialSpec,
-    system: System,
-    predict: Callable[[Array, Array], Array],
-    outputs: Array,
-    inputs: Array,
-    rows: list[int],
-) -> Array:
-    """Return estimates of the states, (T + 1, d), of which some rows were measured."""
-    found, variance = scaled(system), _variance(spec)
-    y, u = found.of_states(outputs, rows), found.of_inputs(inputs)
-    predict = found.scaled_predictions(predict)
-    return found.states * filtered_states(found.system, predict, y, u, variance)
 
 
 def _rows_of(system: System, run: Array) -> slice | list[int]:
@@ -173,12 +164,6 @@ def _check_finite(run: Array, inputs: Array) -> None:
             )
 
 
-def _variance(spec: TrialSpec) -> float:
-    """Return ρ of the filter over the state: the learner's, or the default of joint_ekf."""
-    learner = spec.learner if isinstance(spec.learner, JointKalman) else JointKalman()
-    return learner.noise_variance
-
-
 # States, inputs, errors and predictions of an exploration so far.
 
 
@@ -197,8 +182,14 @@ KINDS = (
 """Kinds of events in :attr:`Explored.counts`."""
 
 
+Run = tuple[npt.ArrayLike, npt.ArrayLike]
+"""States, (T + 1, d), and inputs, (T, m)."""
+
+
 class Explored:
-    """States, inputs, errors and predictions of an exploration.
+    """States, inputs, errors and predictions of an exploration, which can be saved meanwhile.
+
+    Whatever changes it holds ``_lock``, so that another thread can save it.
 
     Attributes
     ----------
@@ -208,6 +199,12 @@ class Explored:
 
     def __init__(self, spec: TrialSpec) -> None:
         self.spec, self._state = spec, ExplorerState(spec)
+        self._lock, self._closed = threading.Lock(), False
+        self._saving = threading.Lock()
+        self._savers: dict[str | None, ExplorationSaver] = {}
+        weakref.finalize(self, _close, self._savers)
+        self._begun = time.perf_counter(), time.process_time()
+        self._times = np.full((2, spec.system.horizon), np.nan)  # µs of ask() and tell()
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -314,55 +311,6 @@ class Explored:
         """
         return free_run_error(self.spec, self.predict, states, inputs, steps, self._state.system)
 
-
-def predict(
-    spec: TrialSpec,
-    parameters: Array,
-    states: npt.ArrayLike,
-    inputs: npt.ArrayLike | None = None,
-) -> Array:
-    """Return the accelerations, (N, r), that a model of given parameters has learned."""
-    system = spec.system
-    at = _rows("states", states, system.n_states)
-    u = None if inputs is None else _rows("inputs", inputs, system.n_inputs)
-    if u is not None and len(u) != len(at):
-        raise SpecificationError(
-            f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
-            f"give the input of each state."
-        )
-    return learned_accelerations(spec, parameters, at, u)
-
-
-def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
-    rows = np.atleast_2d(reals(what, given))
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise SpecificationError(
-            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
-            f"them."
-        )
-    return rows
-
-
-Run = tuple[npt.ArrayLike, npt.ArrayLike]
-"""States, (T + 1, d), and inputs, (T, m)."""
-
-
-class SavedExplored(Explored):
-    """An exploration that can be saved while it goes on.
-
-    Whatever changes it holds ``_lock``, so that another thread can save it.
-    """
-
-    def __init__(self, spec: TrialSpec) -> None:
-        super().__init__(spec)
-        self._lock = threading.Lock()
-        self._closed = False
-        self._saving = threading.Lock()
-        self._savers: dict[str | None, ExplorationSaver] = {}
-        weakref.finalize(self, _close, self._savers)
-        self._begun = time.perf_counter(), time.process_time()
-        self._times = np.full((2, spec.system.horizon), np.nan)  # µs of ask() and tell()
-
     def save(self, url: str | None = None, test: Run | None = None) -> bool:
         """Store the exploration so far as a trial in the results database of the launches.
 
@@ -460,6 +408,34 @@ class SavedExplored(Explored):
         """End the launches of the saves."""
         with self._saving:
             _close(self._savers)
+
+
+def predict(
+    spec: TrialSpec,
+    parameters: Array,
+    states: npt.ArrayLike,
+    inputs: npt.ArrayLike | None = None,
+) -> Array:
+    """Return the accelerations, (N, r), that a model of given parameters has learned."""
+    system = spec.system
+    at = _rows("states", states, system.n_states)
+    u = None if inputs is None else _rows("inputs", inputs, system.n_inputs)
+    if u is not None and len(u) != len(at):
+        raise SpecificationError(
+            f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
+            f"give the input of each state."
+        )
+    return learned_accelerations(spec, parameters, at, u)
+
+
+def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
+    rows = np.atleast_2d(reals(what, given))
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise SpecificationError(
+            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
+            f"them."
+        )
+    return rows
 
 
 def _close(savers: dict[str | None, ExplorationSaver]) -> None:

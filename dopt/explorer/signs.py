@@ -187,20 +187,15 @@ class Signs:
         x, u = state.steps.states[first : state.done + 1], state.steps.inputs[first : state.done]
 
         def accelerations(x: Array, u: Array) -> Array:
-            blocks = zip(
-                self._models,
-                x.reshape(-1, BLOCK, x.shape[1]),
-                u.reshape(-1, BLOCK, u.shape[1]),
-                strict=True,
-            )
+            points = (part.reshape(-1, BLOCK, part.shape[1]) for part in (x, u))
+            blocks = zip(self._models, *points, strict=True)
             return np.concatenate([predicted(system, *block) for block in blocks])
 
         starts, seconds = np.array(self._steps).T
         with np.errstate(all="ignore"):
             moved = (x[1:] - x[:-1]) / seconds[:, None]
-            errors = (
-                moved - (predict(system, accelerations, x[:-1], u[:, None])[0] - x[:-1]) / system.dt
-            )
+            following = predict(system, accelerations, x[:-1], u[:, None])[0]
+            errors = moved - (following - x[:-1]) / system.dt
         t = np.arange(first, state.done)
         t = t[(t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)]
         at, rows = t - first, list(system.learned_rows)

@@ -183,11 +183,6 @@ class PunctualPlanner:
             return False
         return True
 
-    @property
-    def is_late(self) -> bool:
-        """Whether a plan is still being made."""
-        return self._late is not None and not self._late.done()
-
     def wait(self) -> bool:
         """Wait for a plan that was not ready in time, and return whether there was one."""
         if self._late is None:
@@ -291,7 +286,13 @@ class ExplorerState:
         elif "begin" in event:
             x = np.array(event["begin"])
             self.counts["jumps"] += self.present is not None and not np.array_equal(x, self.present)
-            self._warn_of_jumps()
+            if self.spec.system.n_measured and self.counts["jumps"] == MANY_JUMPS:
+                _log.warning(
+                    "%d times an input was asked for another measurement than the one told last, "
+                    "and the states that are not measured were taken for 0: ask with the one told "
+                    "last",
+                    MANY_JUMPS,
+                )
             self._hold_input(event["time"])
             self._move(x, event["time"])
         elif "gap" in event:
@@ -331,8 +332,7 @@ class ExplorerState:
 
     @property
     def _trial(self) -> Trial:
-        trial: Trial = self.steps.trial  # type: ignore[union-attr]  # of a learner of the kernel
-        return trial
+        return self.steps.trial  # type: ignore[union-attr]  # of a learner of the kernel
 
     def _samples(self, learner: GaussNewton) -> FitRequest:
         from dopt.kernel.learners import Problem
@@ -446,15 +446,6 @@ class ExplorerState:
             self.states[self.done] = state
             self.steps.begin(self.done, self._scaled.of_states(state))
 
-    def _warn_of_jumps(self) -> None:
-        """Say so once if inputs are asked for other measurements than those told last."""
-        if self.spec.system.n_measured and self.counts["jumps"] == MANY_JUMPS:
-            _log.warning(
-                "%d times an input was asked for another measurement than the one told last, and "
-                "the states that are not measured were taken for 0: ask with the one told last",
-                MANY_JUMPS,
-            )
-
     def _learn(self, event: Event) -> None:
         t, x, asked = self.done, np.array(event["learn"]), np.array(event["applied"])
         u, dt = self.flight.depart(asked), self._scaled.of_seconds(event["dt"])
@@ -465,7 +456,8 @@ class ExplorerState:
         finite = self.steps.take_in(t, dt)
         if self.renewal is not None:
             self.renewal.note()
-        self.errors[t] = self.steps.errors[t] * self._unit if error is None else error
+        unit = 1.0 if self.spec.system.n_measured else float(self._scaled.accelerations[0])
+        self.errors[t] = self.steps.errors[t] * unit if error is None else error
         estimated = self.steps.states[t + 1] * self._scaled.states
         self.states[t + 1] = estimated if self.spec.system.n_measured else x
         if u is not asked:
@@ -498,11 +490,6 @@ class ExplorerState:
             seen: Array = change[rows] / dt - known[rows]
         return seen
 
-    @property
-    def _unit(self) -> float:
-        """What an error of a step is multiplied by, if that is one number."""
-        return 1.0 if self.spec.system.n_measured else float(self._scaled.accelerations[0])
-
     def _error(self, t: int, dt: float) -> float | None:
         """Return the error of accelerations that have several units; None if they have one."""
         units = self._scaled.accelerations
@@ -523,15 +510,14 @@ class ExplorerState:
 
     def _watch_size(self, t: int, following: Array, u: Array, dt: float) -> None:
         """Warn once where the first accelerations are of another size than a network learns."""
-        system, measured = self.spec.system, self.spec.system.n_measured
-        if t < SIZED_STEPS and isinstance(self.spec.model, MLP) and not measured:
-            self._squares += self.accelerations(following, u, dt) ** 2
-            if t == SIZED_STEPS - 1:
-                sizes = np.sqrt(self._squares / SIZED_STEPS)
-                where = f"over the first {SIZED_STEPS} steps"
-                units = self._scaled.accelerations if self._scaled.is_scaled else None
-                found = warn_of_sizes(system, sizes, where, _UNITS, units)
-                self.counts["out_of_scale"] += found
+        system = self.spec.system
+        if t >= SIZED_STEPS or not isinstance(self.spec.model, MLP) or system.n_measured:
+            return
+        self._squares += self.accelerations(following, u, dt) ** 2
+        if t == SIZED_STEPS - 1:
+            sizes, where = np.sqrt(self._squares / SIZED_STEPS), f"over the first {t + 1} steps"
+            units = self._scaled.accelerations if self._scaled.is_scaled else None
+            self.counts["out_of_scale"] += warn_of_sizes(system, sizes, where, _UNITS, units)
 
     def _compare(self, planned: Array) -> None:
         """Say so once if a plan that is replayed is another one than when it was made."""

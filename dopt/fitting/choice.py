@@ -402,10 +402,8 @@ class _Search:
         if self.model is not self.physics:
             size = np.sqrt(np.median(found.squares / found.windows.counts(self.data)))
             self.s = self.weight * max(float(size), LEAST)
-            p, simulator = (
-                self.model.extended(found.p, self.physics),
-                Simulator(self.model, self.data),
-            )
+            p = self.model.extended(found.p, self.physics)
+            simulator = Simulator(self.model, self.data)
             self.p = solve(simulator, found.windows, p, self.s, scale=found.scale).p
         self._settle()
 

@@ -168,8 +168,7 @@ def advance(
     """Return the state and what acts after a time under an input that is held."""
 
     def acts(s: float) -> Array:
-        reached: Array = u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
-        return reached
+        return u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
 
     def rate(state: Array, s: float) -> Array:
         flow: Array = model.derivative(p, state[None], acts(s)[None])[0]
@@ -210,7 +209,8 @@ _BY_MODEL = {"model": "rms", "physics alone": "physics", "linear": "linear"}
 class FittedTrial(MarkedTrial):
     """A fit as a trial, by its plant, its logs and what was tried.
 
-    A fit of the same plant to the same logs in the same way has the same key.
+    A fit of the same plant to the same logs in the same way has the same key. Its seed is that of
+    its network, 0 without one.
 
     Attributes
     ----------
@@ -220,14 +220,14 @@ class FittedTrial(MarkedTrial):
     """
 
     def __init__(self, found: Any) -> None:
-        self.seed = 0
+        self.seed = found.selection.seed if found.has_network else 0
         rows, states, loss = _simulated(found)
         self._step = _step(found.data, rows)
         self.result = _result(found, rows, states, loss, self._step)
         model, n_steps = found.chosen.model, len(rows) - 1
         named: dict[str, object] = {"name": "constants"}
         if found.has_network:
-            drawn = hashlib.sha256(model.prior.tobytes()).hexdigest()  # which stands for the seed
+            drawn = hashlib.sha256(model.prior.tobytes()).hexdigest()
             named = {"name": "network", "width": model.width, "start": drawn}
         tests = data_of(found.plant, found.tests, found.hold) if found.tests else None
         self._content = {
@@ -298,7 +298,7 @@ def _result(found: Any, rows: Integers, states: Array, loss: Array, step: float)
         inputs=found.data.inputs[rows[:-1]],
         parameters=found.chosen.solution.p,
         diverged_at=None,
-        wall_seconds=math.nan,
+        wall_seconds=found.selection.seconds,
         cpu_seconds=math.nan,
         assessments=(*_numbers(found, n), *_errors(found, n, step)),
     )

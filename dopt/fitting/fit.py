@@ -17,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -141,7 +142,8 @@ def fit(
     chosen = physics
     if width and (found := work.choose_network(width, weights, seed)) is not None:
         chosen = work.finish(*found)
-    return Fitted(plant, hold, work.data, chosen, physics, work.held_out(), work.selection(), tests)
+    held_out = work.held_out()
+    return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
 
 
 class _Selection:
@@ -155,6 +157,7 @@ class _Selection:
         workers: int,
         say: Callable[[str], None],
     ) -> None:
+        self._began = time.perf_counter()
         self.plant, self.data, self.blocks, self.say = plant, data, blocks, say
         self.workers, self._all_blocks = workers, blocks
         self.delay = first_guess(plant.delay)
@@ -176,12 +179,15 @@ class _Selection:
             free_lag=isinstance(self.plant.lag, Unknown),
         )
 
-    def selection(self) -> Selection:
-        return Selection(tuple(self.table), self.window, dict(self.scan), tuple(self.notes))
+    def selection(self, seed: int) -> Selection:
+        seconds = time.perf_counter() - self._began
+        told = tuple(self.table), self.window, dict(self.scan), tuple(self.notes)
+        return Selection(*told, seed, seconds)
 
     def lengths(self, window: float | None) -> list[float]:
         """Return the lengths of windows that are tried [s], the shortest first."""
-        longest = max(self.data.time[b] - self.data.time[a] for a, b in self._pieces())
+        firsts, time = np.unique(self.data.firsts), self.data.time
+        longest = float((time[self.data.lasts[firsts]] - time[firsts]).max())
         if window is not None:
             if not (math.isfinite(window) and 2 * self.step < window < longest):
                 raise SpecificationError(
@@ -199,10 +205,6 @@ class _Selection:
                 f"{2 * FEWEST_ROWS} samples, are expected: give a longer run."
             )
         return fitting or [least]
-
-    def _pieces(self) -> list[tuple[int, int]]:
-        firsts = np.unique(self.data.firsts)
-        return [(int(first), int(self.data.lasts[first])) for first in firsts]
 
     def _longest_block(self) -> float:
         """Return the longest time of a block without a gap [s]."""
@@ -494,8 +496,7 @@ def _blocks(data: Data, runs: Sequence[Log]) -> list[tuple[int, int]]:
     N = len(data.time)
     cuts = np.linspace(0, N, BLOCKS + 1).astype(int)
     if len(runs) >= 3:
-        sizes = [len(data_of_log) for data_of_log in rows_of_logs(data, runs)]
-        ends = np.cumsum([0, *sizes])
+        ends = np.cumsum([0, *map(len, rows_of_logs(data, runs))])
         parts = min(len(runs), BLOCKS + 1)
         cuts = ends[np.linspace(0, len(runs), parts + 1).round().astype(int)]
     return [(int(a), int(b) - 1) for a, b in itertools.pairwise(cuts) if b > a]
@@ -527,11 +528,8 @@ def measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
     measured = {}
     for name in plant.states:
         if all(name in run.states for run in runs):
-            at = [run.states.index(name) for run in runs]
             columns = [
-                piece.measured[:, i]
-                for run, i in zip(runs, at, strict=True)
-                for piece in run.pieces
+                piece.measured[:, run.states.index(name)] for run in runs for piece in run.pieces
             ]
             measured[name] = max(1e-3 * float(np.nanstd(np.concatenate(columns))), 1e-300)
     return dataclasses.replace(plant, measured=measured)

@@ -48,12 +48,14 @@ class Estimate(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """What validation over blocks has compared: losses with standard errors, and notes."""
+    """What validation over blocks has compared: losses with standard errors, and notes; and how."""
 
     table: tuple[tuple[str, float, float], ...]
     window: float  # length that was chosen [s]
     delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
+    seed: int  # of the network that was tried
+    seconds: float  # wall time of the fit [s]
 
 
 class Simulation(NamedTuple):
@@ -345,7 +347,39 @@ class Fitted:
 
     def report(self) -> str:
         """Return what was found, line by line, with units."""
-        return report_of(self)
+        plant, selection = self.plant, self.selection
+        lines = ["Constants (standard errors: windows as clusters, without a network)"]
+        for name, (value, error) in self.constants.items():
+            unit = " s" if name in ("delay", "lag") and name not in plant.constants else ""
+            lines.append(f"  {name:<12} {value:.5g} ± {error:.2g}{unit}")
+        lines += [f"  {name:<12} {value:.5g} (given)" for name, value in self.given.items()]
+        lines += ["", "Held-out loss of what was tried (mean over blocks, standard error)"]
+        lines += [f"  {what:<36} {loss:.4f} ± {error:.4f}" for what, loss, error in selection.table]
+        network = "with a network" if self.has_network else "constants alone"
+        lines.append(f"  chosen: {network}, windows of {selection.window:.3g} s")
+        lines += [f"  note: {note}" for note in selection.notes]
+        where = "runs for validation" if self.tests else "held-out blocks"
+        lines += ["", f"Error of predictions on {where} (root mean square; median)"]
+        rows = self.errors()
+        for name in self.noise:
+            lines.append(f"  {name} [{plant.states[name]}]")
+            for horizon in sorted({row["horizon"] for row in rows}):
+                here = [row for row in rows if row["state"] == name and row["horizon"] == horizon]
+                models = ", ".join(f"{row['model']} {row['rms']:.3g}" for row in here)
+                best = next(row for row in here if row["model"] == "model")
+                lines.append(
+                    f"    {horizon:.3g} s: {models}, nothing changes {best['nothing_changes']:.3g};"
+                    f" median of the model {best['median']:.3g}"
+                )
+        lines.append("")
+        for name, share in self.coverage().items():
+            lines.append(f"Bounds of 90 % hold {100 * share:.0f} % of held-out {name}.")
+        for name, (own, other) in self.whiteness().items():
+            lines.append(
+                f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with "
+                f"an earlier input (0: white)."
+            )
+        return "\n".join([*lines, self.verdict()])
 
     def store(self, url: str | None = None) -> str:
         """Store the fit as a trial in the results database of the launches.
@@ -445,44 +479,3 @@ def _correlation(a: Array, b: Array) -> float:
     if len(a) < 3 or a.std() == 0.0 or b.std() == 0.0:
         return 0.0
     return float(np.corrcoef(a, b)[0, 1])
-
-
-def report_of(found: Fitted) -> str:
-    """Return the report of a fit."""
-    plant, selection = found.plant, found.selection
-    units = {name: plant.states[name] for name in plant.states}
-    lines = ["Constants (standard errors: windows as clusters, without a network)"]
-    for name, (value, error) in found.constants.items():
-        unit = " s" if name in ("delay", "lag") and name not in plant.constants else ""
-        lines.append(f"  {name:<12} {value:.5g} ± {error:.2g}{unit}")
-    lines += [f"  {name:<12} {value:.5g} (given)" for name, value in found.given.items()]
-    lines.append("")
-    lines.append("Held-out loss of what was tried (mean over blocks, standard error)")
-    lines += [f"  {what:<36} {loss:.4f} ± {error:.4f}" for what, loss, error in selection.table]
-    network = "with a network" if found.has_network else "constants alone"
-    lines.append(f"  chosen: {network}, windows of {selection.window:.3g} s")
-    lines += [f"  note: {note}" for note in selection.notes]
-    lines.append("")
-    where = "runs for validation" if found.tests else "held-out blocks"
-    lines.append(f"Error of predictions on {where} (root mean square; median)")
-    rows = found.errors()
-    for name in found.noise:
-        lines.append(f"  {name} [{units[name]}]")
-        for horizon in sorted({row["horizon"] for row in rows}):
-            here = [row for row in rows if row["state"] == name and row["horizon"] == horizon]
-            models = ", ".join(f"{row['model']} {row['rms']:.3g}" for row in here)
-            best = next(row for row in here if row["model"] == "model")
-            lines.append(
-                f"    {horizon:.3g} s: {models}, nothing changes {best['nothing_changes']:.3g}; "
-                f"median of the model {best['median']:.3g}"
-            )
-    lines.append("")
-    for name, share in found.coverage().items():
-        lines.append(f"Bounds of 90 % hold {100 * share:.0f} % of held-out {name}.")
-    for name, (own, other) in found.whiteness().items():
-        lines.append(
-            f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with an "
-            f"earlier input (0: white)."
-        )
-    lines.append(found.verdict())
-    return "\n".join(lines)

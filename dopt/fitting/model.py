@@ -255,7 +255,7 @@ class Model:
         seed: int = 0,
         longest_step: float | None = None,
     ) -> None:
-        self.plant, self.width, self.layout, self.delay = plant, width, layout, delay
+        self.plant, self.width, self.delay = plant, width, delay
         system = plant.system(1)
         self.d, self.m = len(plant.states), len(plant.inputs)
         known = compiled_known(PlantKey(plant))
@@ -382,8 +382,7 @@ class Model:
         phi = np.select(
             [s.feature_kinds == 1, s.feature_kinds == 2], [np.cos(x), np.sin(x)], scaled
         )
-        out: Array = (np.tanh(phi @ W1.T + b1) @ W2.T + b2) * self.sizes
-        return out
+        return (np.tanh(phi @ W1.T + b1) @ W2.T + b2) * self.sizes
 
     def matrices(self, weights: Array) -> tuple[Array, Array, Array, Array]:
         """Return W₁, (w, p), b₁, (w,), W₂, (r, w), and b₂, (r,), of the network."""
@@ -404,11 +403,8 @@ def measured_names(plant: Plant) -> tuple[str, ...]:
 
 def rates_of(plant: Plant, measured: Sequence[int]) -> dict[int, tuple[int, float]]:
     """Return of which measured state another one is the rate, and in how many of its units."""
-    states, system = (
-        np.random.default_rng(0).uniform(0.5, 1.5, (len(plant.states), 8)),
-        plant.system(1),
-    )
-    inputs = np.ones((len(plant.inputs), 8))
+    states = np.random.default_rng(0).uniform(0.5, 1.5, (len(plant.states), 8))
+    inputs, system = np.ones((len(plant.inputs), 8)), plant.system(1)
     with np.errstate(all="ignore"):
         flow = system.known(tuple(states), tuple(inputs), system.parameters)
         rates = np.stack(np.broadcast_arrays(*flow, states[0])[:-1])
@@ -478,21 +474,14 @@ def _first_deviations(plant: Plant, measured: Array) -> Array:
     """Return declared standard deviations of the noise, or a thousandth of what was seen."""
     out = []
     for name, column in zip(measured_names(plant), measured.T, strict=True):
-        noise = plant.measured.get(name)
-        if isinstance(noise, Encoder):
-            out.append(noise.noise)
-        elif noise is not None:
-            out.append(float(noise))
-        else:
-            out.append(max(1e-3 * float(np.nanstd(column)), 1e-300))
+        noise = plant.measured.get(name, max(1e-3 * float(np.nanstd(column)), 1e-300))
+        out.append(noise.noise if isinstance(noise, Encoder) else float(noise))
     return np.array(out)
 
 
 def _interpolated(piece: Piece) -> Piece:
     t, y, u = piece
-    parts = max(1, math.ceil(float(np.median(np.diff(t))) / FINEST))
-    if parts == 1:
-        parts = 2
+    parts = max(2, math.ceil(float(np.median(np.diff(t))) / FINEST))
     share = np.arange(parts) / parts
     time = np.concatenate([(t[:-1, None] + np.diff(t)[:, None] * share).ravel(), t[-1:]])
     middle = (share + 0.5 / parts)[None, :, None]

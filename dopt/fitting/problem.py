@@ -8,6 +8,8 @@ with e_k the residuals of window k in standard deviations, ρ(r) = c log(1 + r/c
 (windows that nothing fits count little), p in standard deviations of its prior, and s the factor
 by which the residuals count as larger than their deviations say: they are smooth curves, so that
 few of those in a window are independent. A step is taken by the method of Levenberg and Marquardt.
+It eliminates the initial states, whose steps are not damped: where they lead too far, a window that
+fits worse than before takes a damped one, so that it holds up no other.
 
 Predictions of parts of a log are at the end, with a linear model for comparison.
 """
@@ -42,7 +44,7 @@ FIRST_DAMPING = 1.0
 LEAST_DAMPING = 1e-6
 
 LARGEST_DAMPING = 1e12
-"""Damping at which no step is short enough: a minimum up to rounding."""
+"""Damping at which no step is short enough: a minimum up to rounding if little is foreseen."""
 
 STUCK = 1e12
 """What a window that leaves the limit counts for, by c."""
@@ -287,14 +289,23 @@ def solve(
             step = cho_solve(factor, b, check_finite=False)
             trial = p + step
             moved = windows._replace(starts=_moved(windows.starts, linear, step))
-            after = simulator.squares(trial, moved)
+            after, held = simulator.squares(trial, moved), np.zeros(1, bool)
+            if not cost(after, trial) < value:
+                size = max(np.trace(H) / max(model.q, 1), 1.0)
+                share = size / (size + damping)  # about as p is damped
+                damped = _moved(windows.starts, linear, step, share)
+                others = simulator.squares(trial, windows._replace(starts=damped))
+                held = (after > squares) & (others < after)
+                moved = windows._replace(starts=np.where(held[:, None], damped, moved.starts))
+                after = np.where(held, others, after)
             new = cost(after, trial)
             if new < value:
                 break
             damping *= growth
             growth *= 2.0
         if not new < value:
-            converged = True
+            foreseen = b @ np.linalg.solve(H, b) + np.sum(linear.g**2)
+            converged = bool(foreseen < tolerance * value)
             break
         fall, foreseen = value - new, float(step @ (b + damping * step))
         ratio = fall / foreseen if foreseen > 0.0 else 1.0
@@ -302,14 +313,14 @@ def solve(
         p, windows, squares = trial, moved, after
         if say:
             say(f"  step {steps}: cost {new:.6g}, fall {fall / value:.1e}, damping {damping:.0e}")
-        calm = calm + 1 if fall < tolerance * value else 0
+        calm = calm + 1 if fall < tolerance * value and not held.any() else 0
         value, converged = new, calm >= 2
     return Solution(p, windows, squares, scale, steps, converged)
 
 
-def _moved(starts: Array, linear: Linear, step: Array) -> Array:
-    """Return the initial states after a step of the parameters."""
-    right = linear.g - linear.C @ step
+def _moved(starts: Array, linear: Linear, step: Array, share: float = 1.0) -> Array:
+    """Return the initial states after a step of the parameters, and a share of their own step."""
+    right = share * linear.g - linear.C @ step
     d = starts.shape[1]
     delta = np.zeros_like(starts)
     for i in range(d - 1, -1, -1):  # back substitution, a column without a pivot stays

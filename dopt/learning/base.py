@@ -9,15 +9,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.fields import LEARN_IN_NUMPY, KernelPart, parameter
 from dopt.registry import check_returned
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array as Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -388,13 +388,8 @@ class JointKalman(InformationLearner):
     steps: int = parameter(12, "steps", "positive")
     noise: str = parameter("given", choices=("given", "fitted"), added=True)
 
-    @property
-    def fits_noise(self) -> bool:
-        """Whether a fit estimates ρ."""
-        return self.noise == "fitted"
-
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
-        fit = float(self.refit_every), float(self.steps), float(self.fits_noise)
+        fit = float(self.refit_every), float(self.steps), float(self.noise == "fitted")
         return regularization, self.noise_variance, self.underweighting, *fit
 
 

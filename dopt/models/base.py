@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.fields import KernelSupport, parameter
 from dopt.systems.base import Feature, System, feature_values, with_inputs
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +200,7 @@ class AffineMLP(BlackBoxMLP):
         m = system.n_inputs
         u = features[:, -m:]
         products = [hidden * u[:, j : j + 1] for j in range(m)]
-        inputs: Array = np.concatenate([hidden, *products, u], axis=1)
-        return inputs
+        return np.concatenate([hidden, *products, u], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)

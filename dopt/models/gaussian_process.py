@@ -8,8 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.fields import parameter
-from dopt.models.base import Array, Model
+from dopt.models.base import Model
 from dopt.systems.base import System
+from dopt.types import Array
 
 ROUNDING = 1e-10
 """Least variance of the noise, by the prior variance: the factorisation needs some."""

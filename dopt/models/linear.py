@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from dopt.fields import parameter
-from dopt.models.base import Array, Model
+from dopt.models.base import Model
 from dopt.systems.base import Feature, System
-from dopt.types import Scalar
+from dopt.types import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +41,7 @@ class Linear(Model):
             for form in system.linear_form
         )
         regressors = np.stack([unit - offset for unit in units], axis=-1)
-        predicted: Array = offset + regressors @ parameters
-        return predicted
+        return offset + regressors @ parameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +92,7 @@ class RFF(Model):
         weights = parameters[:first].reshape(system.n_learned, self.n_features)
         frequencies = parameters[first:last].reshape(self.n_features, len(system.features))
         waves = np.cos(system.featurize(points) @ frequencies.T + parameters[last:])
-        predicted: Array = self.scale * waves @ weights.T
-        return predicted
+        return self.scale * waves @ weights.T
 
     @property
     def scale(self) -> float:
@@ -123,8 +120,7 @@ class LinearState(Model):
 
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         matrix = parameters.reshape(system.n_learned, len(system.features))
-        predicted: Array = system.featurize(points) @ matrix.T
-        return predicted
+        return system.featurize(points) @ matrix.T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,12 +171,8 @@ class GreyBox(Model):
     def feature_scales(self, system: System) -> tuple[float, ...]:
         return (1.0,) * len(self.features(system))
 
-    def physical_values(self, system: System, theta: Sequence[Scalar]) -> list[Scalar]:
-        """Return all physical parameters in their order, with q unknown ones, each of any kind."""
-        values = dict(zip(system.physical, system.parameters, strict=True))
-        return list((values | dict(zip(self.names(system), theta, strict=True))).values())
-
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
-        values = self.physical_values(system, parameters.tolist())
-        rows = system.accelerations(tuple(points.T), values)
+        values = dict(zip(system.physical, system.parameters, strict=True))
+        values |= dict(zip(self.names(system), parameters.tolist(), strict=True))
+        rows = system.accelerations(tuple(points.T), list(values.values()))
         return np.stack(np.broadcast_arrays(*rows, points[:, 0])[:-1], axis=-1)

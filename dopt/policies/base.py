@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.control.task import Control, Feedback, Goal
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.fields import PLAN_IN_NUMPY, KernelPart, parameter
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array as Array
 
 ROUNDING = 1e-9
 """Share of γ by which an input may exceed it."""
@@ -234,8 +232,7 @@ def check_norms(name: str, inputs: Array, first: int, gamma: float) -> None:
 
 def ball_norms(rng: np.random.Generator, size: tuple[int, int], dimensions: int | Array) -> Array:
     """Return norms of points that are drawn uniformly from the unit ball of some dimensions."""
-    norms: Array = rng.uniform(size=size) ** (1.0 / dimensions)
-    return norms
+    return rng.uniform(size=size) ** (1.0 / dimensions)
 
 
 def on_sphere(vectors: Array, radius: float) -> Array:

@@ -176,7 +176,15 @@ class GradientPlan(Planner):
         self._policy, self._candidates = policy, policy.compared_inputs(system)
 
     def choose(self, view: TrialView) -> Array:
-        return optimum(Gain(view), self._candidates, self._policy)
+        gain, starts, policy = Gain(view), self._candidates, self._policy
+        values = np.array([gain.value(u) for u in starts])
+        chosen = np.argsort(-values, kind="stable")[: policy.starts]
+        found = [(values[i], starts[i]) for i in chosen]
+        if starts.shape[1] > 1:
+            angle = math.pi / len(starts)
+            found = [ascend(gain.slope, u, angle, policy.iterations) for _, u in found]
+        best: Array = found[int(np.argmax([value for value, _ in found]))][1]
+        return best
 
 
 class Gain:
@@ -207,18 +215,6 @@ class Gain:
     def _following(self, inputs: Array) -> Array:
         """Return the states, (N, d), that the model predicts when inputs, (N, m), have acted."""
         return self._view.held(inputs, 1 + self._view.system.lead_steps)
-
-
-def optimum(gain: Gain, starts: Array, search: GradientDOptimal) -> Array:
-    """Return the best input, (m,), found from inputs (C, m) on the sphere."""
-    values = np.array([gain.value(u) for u in starts])
-    chosen = np.argsort(-values, kind="stable")[: search.starts]
-    found = [(values[i], starts[i]) for i in chosen]
-    if starts.shape[1] > 1:
-        angle = math.pi / len(starts)
-        found = [ascend(gain.slope, u, angle, search.iterations) for _, u in found]
-    best: Array = found[int(np.argmax([value for value, _ in found]))][1]
-    return best
 
 
 def ascend(
@@ -324,15 +320,13 @@ def is_linear(system: System) -> bool:
     if any(f.kind != "identity" for f in system.features) or seen != [*range(system.n_states)]:
         return False
     points = np.random.default_rng(0).standard_normal((3, 2, system.n_states + system.n_inputs))
-    return all(_adds_up(system, one, other) for one, other in points)
-
-
-def _adds_up(system: System, one: Array, other: Array) -> bool:
     d = system.n_states
-    whole, first, second = (
-        system.derivative(z[:d], z[d:]) for z in (one + 2.0 * other, one, other)
-    )
-    return bool(np.allclose(whole, first + 2.0 * second, rtol=1e-9, atol=1e-9))
+    for one, other in points:
+        sums = one + 2.0 * other, one, other
+        whole, first, second = (system.derivative(z[:d], z[d:]) for z in sums)
+        if not np.allclose(whole, first + 2.0 * second, rtol=1e-9, atol=1e-9):
+            return False
+    return True
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -119,11 +119,11 @@ class DisagreementPlan(Planner):
         networks: Networks,
         rng: np.random.Generator,
     ) -> None:
-        self._system, self._networks, self._steps = system, networks, policy.lookahead
-        self._steps += system.lead_steps
+        self._system, self._networks = system, networks
+        self._steps = policy.lookahead + system.lead_steps
         self._inputs = policy.compared_inputs(system)
-        drawn = [networks.initial_parameters(rng) for _ in range(policy.ensemble - 1)]
-        self._others = np.array(drawn)
+        draw = functools.partial(networks.model.initial_parameters, system, rng)
+        self._others = np.array([draw() for _ in range(policy.ensemble - 1)])
         self._moments, self._done = np.zeros((2, *self._others.shape)), 0
 
     def choose(self, view: TrialView) -> Array:
@@ -162,11 +162,7 @@ class Networks:
     """Networks of one architecture that learn together; parameters are (K, q)."""
 
     def __init__(self, system: System, model: MLP, learner: Adam) -> None:
-        self._system, self._model, self.learner = system, model, learner
-
-    def initial_parameters(self, rng: np.random.Generator) -> Array:
-        """Return the parameters of one network before it learns, (q,)."""
-        return self._model.initial_parameters(self._system, rng)
+        self._system, self.model, self.learner = system, model, learner
 
     def predict(self, parameters: Array, states: Array) -> Array:
         """Return the accelerations of each network, (K, N, r), at states (N, d)."""
@@ -184,7 +180,7 @@ class Networks:
 
     def _layers(self, parameters: Array) -> list[tuple[Array, Array]]:
         """Return views of the weights, (K, outputs, inputs), and biases of each layer."""
-        sizes, first, layers = self._model.layer_sizes(self._system), 0, []
+        sizes, first, layers = self.model.layer_sizes(self._system), 0, []
         for n_in, n_out in itertools.pairwise(sizes):
             middle, last = first + n_in * n_out, first + (n_in + 1) * n_out
             W = parameters[:, first:middle].reshape(len(parameters), n_out, n_in)
@@ -275,7 +271,8 @@ class SpaceFillingPlan(Planner):
 
     def worth(self, view: TrialView, inputs: Array) -> Array:
         """Return what each of some inputs, (C, m), is worth, (C,)."""
-        points = view.points(self._led_to(view, inputs), inputs)
+        reached = view.held(inputs, self._policy.lookahead + view.system.lead_steps)
+        points = view.points(reached, inputs)
         samples = view.points(view.sampled, view.sampled_inputs)
         apart = _squared_distances(self._features(points), self._features(samples))
         if self._policy.criterion == "gsx":
@@ -286,10 +283,6 @@ class SpaceFillingPlan(Planner):
         if self._policy.criterion == "igs":
             return _root_of_least(apart * differing)
         return _by_inverse_distances(apart, differing, self._policy.weight)
-
-    def _led_to(self, view: TrialView, inputs: Array) -> Array:
-        """Return the states, (C, d), after ``lookahead`` predicted steps with inputs, (C, m)."""
-        return view.held(inputs, self._policy.lookahead + view.system.lead_steps)
 
     def _features(self, points: Array) -> Array:
         """Return the features of states with inputs, (N, ·), behind them where they are read."""

@@ -173,10 +173,7 @@ class Exact(Search):
 
     name: ClassVar[str] = "exact"
     compiled: ClassVar[bool] = True
-
-    @property
-    def score(self) -> str:
-        return "joint"
+    score: ClassVar[str] = "joint"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,10 +186,7 @@ class Trace(Search):
 
     name: ClassVar[str] = "trace"
     compiled: ClassVar[bool] = True
-
-    @property
-    def score(self) -> str:
-        return "trace"
+    score: ClassVar[str] = "trace"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,10 +199,7 @@ class AOptimal(Search):
 
     name: ClassVar[str] = "a_optimal"
     compiled: ClassVar[bool] = True
-
-    @property
-    def score(self) -> str:
-        return "a"
+    score: ClassVar[str] = "a"
 
 
 _START_SEED = 1_712
@@ -232,12 +223,9 @@ class EOptimal(Search):
 
     name: ClassVar[str] = "e_optimal"
     compiled: ClassVar[bool] = True
+    score: ClassVar[str] = "e"
 
     subspace: int = parameter(32, "dimensions", "positive")
-
-    @property
-    def score(self) -> str:
-        return "e"
 
     def starts(self, n_parameters: int, n_learned: int) -> Array:
         """Return the vectors that span the Krylov space at first, (≤ r + 1, q)."""
@@ -270,15 +258,12 @@ class TaskOptimal(Search):
 
     name: ClassVar[str] = "task"
     compiled: ClassVar[bool] = True
+    score: ClassVar[str] = "task"
 
     states: str = parameter("grid", choices=("grid", "reachable"))
     count: int = parameter(32, "states", "positive")
     goal: tuple[float, ...] = parameter(())
     radius: float = parameter(0.5, "half-widths", "positive")
-
-    @property
-    def score(self) -> str:
-        return "task"
 
     def check(self, system: System) -> None:
         if self.states == "reachable" and isinstance(system, BlackBox):

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dopt.control.task import Feedback
 from dopt.custom_planner import custom_planner
@@ -34,7 +34,6 @@ from dopt.reference.models import (
     known_flow,
     model_function,
     model_states,
-    network_function,
     next_states,
     planning_columns,
     quadratic_problem,
@@ -52,8 +51,8 @@ from dopt.types import Array
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 
-class BatchState:
-    """n trials of one configuration in torch, before their first step.
+class BatchSteps:
+    """The steps of n trials in torch, whatever comes between them: a simulation or a measurement.
 
     Parameters
     ----------
@@ -61,9 +60,6 @@ class BatchState:
         Trials that differ in the seed alone.
     device : str
         Torch device, ``"cpu"`` or ``"cuda"``.
-    module : torch.nn.Module, optional
-        Network from features to accelerations in place of the registered model; its parameters at
-        the time of the call are the initial ones of every trial.
 
     Attributes
     ----------
@@ -79,6 +75,10 @@ class BatchState:
         M in the space to which ``project`` maps gradients, (..., q).
     diverged : (n, 1) tensor
         Whether a trial has ended.
+    planners : list of Planner
+        The plan of each trial where the policy is written in numpy.
+    learner : object
+        What takes the learning step of the batch.
     noise, open_loop, ties, components : tensors
         Numbers of :class:`dopt.randomness.Draws` with the trials along the first axis.
 
@@ -88,9 +88,7 @@ class BatchState:
         If the trials belong to different configurations.
     """
 
-    def __init__(
-        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-    ) -> None:
+    def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
         if len({spec.config_key for spec in specs}) != 1:
             raise SpecificationError(
                 f"{len(specs)} trials of different configurations were given, but the trials "
@@ -103,15 +101,21 @@ class BatchState:
         self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
         self.ties = self.tensor(np.stack([d.ties for d in draws]))
         self.components = torch.tensor(np.stack([d.components for d in draws]), device=device)
-        if module is None:
-            self.model: BatchModel = model_function(self.system, self.config.model)
-            self.theta = self.tensor(np.stack([d.weights for d in draws]))
-        else:
-            self.model = network_function(self.system, module)
-            flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
-            self.theta = flat.to(device).repeat(len(specs), 1)
+        self.model: BatchModel = model_function(self.system, self.config.model)
+        self.theta = self.tensor(np.stack([d.weights for d in draws]))
         self._allocate()
         self._hold_information()
+        plans = (custom_planner(spec) for spec in self.specs)
+        self.planners = [plan for plan in plans if plan is not None]
+        learner, policy = self.config.learner, self.config.policy
+        self.learner: AdamLearner | NumpyLearner | LeastSquaresLearner
+        if isinstance(learner, Adam):
+            self.learner = AdamLearner(learner, self)
+        elif isinstance(learner, CustomLearner):
+            self.learner = NumpyLearner(learner, self)
+        else:
+            ridge = getattr(policy, "regularization", getattr(learner, "regularization", 1.0))
+            self.learner = LeastSquaresLearner(float(ridge), self)
 
     def tensor(self, values: Array) -> Tensor:
         """Return real numbers as a tensor where the trials are."""
@@ -166,181 +170,6 @@ class BatchState:
             observed = observed - (step - self.model(self.theta, at.unsqueeze(1)).squeeze(1))
         self.targets[:, t] = observed
 
-    def alive(self) -> list[int]:
-        """Return the places of the trials that have not diverged."""
-        return [i for i, ended in enumerate(self.diverged[:, 0].tolist()) if not ended]
-
-
-class BatchTrialView(TrialView):
-    """Trial ``index`` of a batch after t steps, for a plan or an update in numpy."""
-
-    def __init__(self, batch: BatchState, index: int, t: int) -> None:
-        self.system, self.t = batch.system, t
-        self._model, self._theta = batch.model, batch.theta[index].clone()
-        self._batch, self._index = batch, index
-        self.states = _array(batch.states[index, : t + 1])
-        self.inputs = self.sampled_inputs = _array(batch.inputs[index, :t])
-        self.sampled = _array(batch.sampled_states[index, :t])
-        self.accelerations = _array(batch.targets[index, :t])
-        self.parameters = _array(self._theta)
-        last = t == self.system.horizon
-        self.tie = np.full(self.system.n_inputs, np.nan) if last else _array(batch.ties[index, t])
-
-    def points(self, states: Array, inputs: Array) -> Array:  # noqa: ARG002  # no model here reads inputs
-        return np.asarray(states, dtype=np.float64)
-
-    def predict(self, states: Array) -> Array:
-        return _array(self._model(self._theta[None], self._tensor(states)[None])[0])
-
-    def jacobian(self, state: Array) -> Array:
-        at = self._tensor(state)[None, None]
-        return _array(jacobian(self._model, self.system.n_learned, self._theta[None], at)[0, 0])
-
-    def jacobian_change(self, state: Array, directions: Array) -> Array:
-        along, r = self._tensor(directions), self.system.n_learned
-        items = len(along) * r
-        _, changes = gradients_and_changes(
-            self._model,
-            self._theta.expand(items, -1),
-            self._tensor(state).expand(items, -1),
-            torch.arange(r, device=along.device).repeat(len(along)),
-            along.repeat_interleave(r, dim=0),
-        )
-        return _array(changes.view(len(along), r, -1))
-
-    @property
-    def covariance(self) -> Array:
-        assert self._batch.information is not None
-        identity = (
-            torch.eye(len(self._theta)).to(self._batch.theta).repeat(len(self._batch.theta), 1, 1)
-        )
-        return _array(self._batch.information.solve(identity)[self._index])
-
-    def following(self, state: Array, inputs: Array) -> Array:
-        u = self._tensor(inputs)
-        x, theta = (one.expand(len(u), -1) for one in (self._tensor(state), self._theta))
-        return _array(model_states(self.system, self._model, theta, x, u, self.system.dt))
-
-    def input_matrix(self, state: Array) -> Array:
-        return _array(input_matrix(self.system, self._tensor(state)[None])[0])
-
-    def _tensor(self, values: Array) -> Tensor:
-        contiguous = np.ascontiguousarray(values)  # torch takes no negative strides
-        return torch.as_tensor(contiguous, dtype=self._theta.dtype, device=self._theta.device)
-
-
-def _array(values: Tensor) -> Array:
-    """Return a copy, so that nobody can change the trial."""
-    array: Array = values.detach().cpu().numpy().copy()
-    return array
-
-
-class AdamLearner:
-    """Adam on the newest samples, for the whole batch at once, as Adam is elementwise."""
-
-    def __init__(self, learner: Adam, batch: BatchState) -> None:
-        self._rule, self._batch = learner, batch
-        self._moments = torch.zeros_like(batch.theta), torch.zeros_like(batch.theta)
-
-    def learn(self, t: int) -> None:
-        """Take one step on the samples up to step t: what torch.optim.Adam computes."""
-        batch, rule, newest = (
-            self._batch,
-            self._rule,
-            slice(max(0, t + 1 - self._rule.window), t + 1),
-        )
-        gradient = loss_gradient(
-            batch.model, batch.theta, batch.sampled_states[:, newest], batch.targets[:, newest]
-        )
-        first, second = self._moments
-        first.lerp_(gradient, 1.0 - rule.beta_1)
-        second.mul_(rule.beta_2).addcmul_(gradient, gradient, value=1.0 - rule.beta_2)
-        unbiased = second.sqrt() / (1.0 - rule.beta_2 ** (t + 1)) ** 0.5
-        rate = rule.learning_rate / (1.0 - rule.beta_1 ** (t + 1))
-        batch.theta.addcdiv_(first, unbiased.add_(rule.epsilon), value=-rate)
-
-
-def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:
-    """Return the gradient of mean_N ‖a_θ(x) - y‖² by θ, (n, q), at (n, N, d) and (n, N, r)."""
-    with torch.enable_grad():
-        at = theta.detach().requires_grad_()
-        squares = (model(at, states) - targets).square().sum(dim=-1)
-        # The gradient of a sum over trials holds each trial's gradient.
-        (gradient,) = torch.autograd.grad(squares.mean(dim=1).sum(), at)
-    return gradient
-
-
-class LeastSquaresLearner:
-    """Least squares over all samples with the ridge λ: θ = (λI + Σ JᵀJ)⁻¹ Σ Jᵀ(y - offset)."""
-
-    def __init__(self, regularization: float, batch: BatchState) -> None:
-        n, q = batch.theta.shape
-        self._batch, self._moment = batch, torch.zeros_like(batch.theta)
-        self._normal = regularization * torch.eye(q).to(batch.theta).repeat(n, 1, 1)
-
-    def learn(self, t: int) -> None:
-        """Absorb the sample of step t."""
-        batch, x = self._batch, self._batch.sampled_states[:, t : t + 1]
-        J = jacobian(batch.model, batch.system.n_learned, batch.theta, x)[:, 0]
-        offset = batch.model(torch.zeros_like(batch.theta), x).squeeze(1)
-        right = (batch.targets[:, t] - offset).unsqueeze(-1)
-        self._normal = self._normal + J.mT @ J
-        self._moment = self._moment + (J.mT @ right).squeeze(-1)
-        batch.theta.copy_(torch.linalg.solve(self._normal, self._moment))
-
-
-class NumpyLearner:
-    """The updates of a learner that is written in numpy, one trial after the other."""
-
-    def __init__(self, learner: CustomLearner, batch: BatchState) -> None:
-        self._batch = batch
-        self._updaters = [
-            learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
-        ]
-
-    def learn(self, t: int) -> None:
-        """Write the parameters that the updates return after step t.
-
-        Raises
-        ------
-        SpecificationError
-            If there are not as many parameters as before.
-        """
-        batch = self._batch
-        for i in batch.alive():
-            updated = self._updaters[i].update(BatchTrialView(batch, i, t + 1))
-            theta = np.asarray(updated, dtype=np.float64)
-            check_update(batch.config.learner.name, theta, tuple(batch.theta[i].shape))
-            batch.theta[i] = torch.as_tensor(theta).to(batch.theta)
-
-
-class BatchSteps(BatchState):
-    """The steps of a batch of trials, whatever comes between them: a simulation or a measurement.
-
-    Attributes
-    ----------
-    planners : list of Planner
-        The plan of each trial where the policy is written in numpy.
-    learner : object
-        What takes the learning step of the batch.
-    """
-
-    def __init__(
-        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-    ) -> None:
-        super().__init__(specs, device, module)
-        plans = (custom_planner(spec) for spec in self.specs)
-        self.planners = [plan for plan in plans if plan is not None]
-        learner, policy = self.config.learner, self.config.policy
-        self.learner: AdamLearner | NumpyLearner | LeastSquaresLearner
-        if isinstance(learner, Adam):
-            self.learner = AdamLearner(learner, self)
-        elif isinstance(learner, CustomLearner):
-            self.learner = NumpyLearner(learner, self)
-        else:
-            ridge = getattr(policy, "regularization", getattr(learner, "regularization", 1.0))
-            self.learner = LeastSquaresLearner(float(ridge), self)
-
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
         policy, system, x = self.config.policy, self.system, self.states[:, t]
@@ -386,17 +215,158 @@ class BatchSteps(BatchState):
             J = jacobian(self.model, self.system.n_learned, self.theta, x)
             self.information.add(self.project(J[:, 0]))
 
+    def alive(self) -> list[int]:
+        """Return the places of the trials that have not diverged."""
+        return [i for i, ended in enumerate(self.diverged[:, 0].tolist()) if not ended]
+
+
+class BatchTrialView(TrialView):
+    """Trial ``index`` of a batch after t steps, for a plan or an update in numpy."""
+
+    def __init__(self, batch: BatchSteps, index: int, t: int) -> None:
+        self.system, self.t = batch.system, t
+        self._model, self._theta = batch.model, batch.theta[index].clone()
+        self._batch, self._index = batch, index
+        self.states = _array(batch.states[index, : t + 1])
+        self.inputs = self.sampled_inputs = _array(batch.inputs[index, :t])
+        self.sampled = _array(batch.sampled_states[index, :t])
+        self.accelerations = _array(batch.targets[index, :t])
+        self.parameters = _array(self._theta)
+        last = t == self.system.horizon
+        self.tie = np.full(self.system.n_inputs, np.nan) if last else _array(batch.ties[index, t])
+
+    def points(self, states: Array, inputs: Array) -> Array:  # noqa: ARG002  # no model here reads inputs
+        return np.asarray(states, dtype=np.float64)
+
+    def predict(self, states: Array) -> Array:
+        return _array(self._model(self._theta[None], self._tensor(states)[None])[0])
+
+    def jacobian(self, state: Array) -> Array:
+        at = self._tensor(state)[None, None]
+        return _array(jacobian(self._model, self.system.n_learned, self._theta[None], at)[0, 0])
+
+    def jacobian_change(self, state: Array, directions: Array) -> Array:
+        along, r = self._tensor(directions), self.system.n_learned
+        items = len(along) * r
+        _, changes = gradients_and_changes(
+            self._model,
+            self._theta.expand(items, -1),
+            self._tensor(state).expand(items, -1),
+            torch.arange(r, device=along.device).repeat(len(along)),
+            along.repeat_interleave(r, dim=0),
+        )
+        return _array(changes.view(len(along), r, -1))
+
+    @property
+    def covariance(self) -> Array:
+        batch = self._batch
+        assert batch.information is not None
+        n, q = batch.theta.shape
+        identity = torch.eye(q).to(batch.theta).repeat(n, 1, 1)
+        return _array(batch.information.solve(identity)[self._index])
+
+    def following(self, state: Array, inputs: Array) -> Array:
+        u = self._tensor(inputs)
+        x, theta = (one.expand(len(u), -1) for one in (self._tensor(state), self._theta))
+        return _array(model_states(self.system, self._model, theta, x, u, self.system.dt))
+
+    def input_matrix(self, state: Array) -> Array:
+        return _array(input_matrix(self.system, self._tensor(state)[None])[0])
+
+    def _tensor(self, values: Array) -> Tensor:
+        contiguous = np.ascontiguousarray(values)  # torch takes no negative strides
+        return torch.as_tensor(contiguous, dtype=self._theta.dtype, device=self._theta.device)
+
+
+def _array(values: Tensor) -> Array:
+    """Return a copy, so that nobody can change the trial."""
+    return values.detach().cpu().numpy().copy()
+
+
+class AdamLearner:
+    """Adam on the newest samples, for the whole batch at once, as Adam is elementwise."""
+
+    def __init__(self, learner: Adam, batch: BatchSteps) -> None:
+        self._rule, self._batch = learner, batch
+        self._moments = torch.zeros_like(batch.theta), torch.zeros_like(batch.theta)
+
+    def learn(self, t: int) -> None:
+        """Take one step on the samples up to step t: what torch.optim.Adam computes."""
+        batch, rule = self._batch, self._rule
+        newest = slice(max(0, t + 1 - rule.window), t + 1)
+        gradient = loss_gradient(
+            batch.model, batch.theta, batch.sampled_states[:, newest], batch.targets[:, newest]
+        )
+        first, second = self._moments
+        first.lerp_(gradient, 1.0 - rule.beta_1)
+        second.mul_(rule.beta_2).addcmul_(gradient, gradient, value=1.0 - rule.beta_2)
+        unbiased = second.sqrt() / (1.0 - rule.beta_2 ** (t + 1)) ** 0.5
+        rate = rule.learning_rate / (1.0 - rule.beta_1 ** (t + 1))
+        batch.theta.addcdiv_(first, unbiased.add_(rule.epsilon), value=-rate)
+
+
+def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:
+    """Return the gradient of mean_N ‖a_θ(x) - y‖² by θ, (n, q), at (n, N, d) and (n, N, r)."""
+    with torch.enable_grad():
+        at = theta.detach().requires_grad_()
+        squares = (model(at, states) - targets).square().sum(dim=-1)
+        # The gradient of a sum over trials holds each trial's gradient.
+        (gradient,) = torch.autograd.grad(squares.mean(dim=1).sum(), at)
+    return gradient
+
+
+class LeastSquaresLearner:
+    """Least squares over all samples with the ridge λ: θ = (λI + Σ JᵀJ)⁻¹ Σ Jᵀ(y - offset)."""
+
+    def __init__(self, regularization: float, batch: BatchSteps) -> None:
+        n, q = batch.theta.shape
+        self._batch, self._moment = batch, torch.zeros_like(batch.theta)
+        self._normal = regularization * torch.eye(q).to(batch.theta).repeat(n, 1, 1)
+
+    def learn(self, t: int) -> None:
+        """Absorb the sample of step t."""
+        batch, x = self._batch, self._batch.sampled_states[:, t : t + 1]
+        J = jacobian(batch.model, batch.system.n_learned, batch.theta, x)[:, 0]
+        offset = batch.model(torch.zeros_like(batch.theta), x).squeeze(1)
+        right = (batch.targets[:, t] - offset).unsqueeze(-1)
+        self._normal = self._normal + J.mT @ J
+        self._moment = self._moment + (J.mT @ right).squeeze(-1)
+        batch.theta.copy_(torch.linalg.solve(self._normal, self._moment))
+
+
+class NumpyLearner:
+    """The updates of a learner that is written in numpy, one trial after the other."""
+
+    def __init__(self, learner: CustomLearner, batch: BatchSteps) -> None:
+        self._batch = batch
+        self._updaters = [
+            learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
+        ]
+
+    def learn(self, t: int) -> None:
+        """Write the parameters that the updates return after step t.
+
+        Raises
+        ------
+        SpecificationError
+            If there are not as many parameters as before.
+        """
+        batch = self._batch
+        for i in batch.alive():
+            updated = self._updaters[i].update(BatchTrialView(batch, i, t + 1))
+            theta = np.asarray(updated, dtype=np.float64)
+            check_update(batch.config.learner.name, theta, tuple(batch.theta[i].shape))
+            batch.theta[i] = torch.as_tensor(theta).to(batch.theta)
+
 
 class Lockstep(BatchSteps):
     """A batch of n trials of one configuration that take each step together.
 
-    Parameters and errors as in :class:`BatchState`.
+    Parameters and errors as in :class:`BatchSteps`.
     """
 
-    def __init__(
-        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
-    ) -> None:
-        super().__init__(specs, device, module)
+    def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
+        super().__init__(specs, device)
         system = self.system
         self._episodes = []
         if isinstance(system, BlackBox):
@@ -468,11 +438,6 @@ class Lockstep(BatchSteps):
         self.columns["learn_us"][:, t] = learned
         self.columns["evaluate_us"][:, t] = evaluated
 
-    def note_checkpoint(self, t: int) -> None:
-        """Keep what has been learned after t steps, which is to be assessed."""
-        self.checkpoints[t] = self.theta.cpu().numpy().copy()
-        self.feedbacks[t] = [planner.feedback() for planner in self.planners]
-
     def _clock(self) -> float:
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)
@@ -481,18 +446,21 @@ class Lockstep(BatchSteps):
 
 @torch.no_grad()
 def run_trials(
-    specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
+    specs: Sequence[TrialSpec], device: str = "cpu", noted: Sequence[int] | None = None
 ) -> list[TrialResult]:
     """Run trials of one configuration in lockstep; each result equals the trial's run alone.
 
-    Parameters and errors as in :class:`BatchState`. The seconds and microseconds of a
-    result are the batch's divided by its size.
+    Parameters and errors as in :class:`BatchSteps`. The seconds and microseconds of a
+    result are the batch's divided by its size. ``noted`` are the steps of its checkpoints, in place
+    of those at which the trial is assessed.
     """
     wall, cpu = time.perf_counter(), time.process_time()
-    batch = Lockstep(specs, device, module)
+    batch = Lockstep(specs, device)
+    noted = specs[0].assessed_steps if noted is None else noted
     for t in range(batch.system.horizon + 1):
-        if t in specs[0].assessed_steps:
-            batch.note_checkpoint(t)
+        if t in noted:
+            batch.checkpoints[t] = batch.theta.cpu().numpy().copy()
+            batch.feedbacks[t] = [planner.feedback() for planner in batch.planners]
         if t < batch.system.horizon:
             batch.step(t)
     n = len(specs)
@@ -525,57 +493,6 @@ def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
     )
 
 
-class ReferenceTrial:
-    """A batch of one trial.
-
-    Attributes
-    ----------
-    done : int
-        Number of steps done.
-    diverged_at : int or None
-        Step at which the trial diverged.
-    """
-
-    def __init__(self, spec: TrialSpec) -> None:
-        with torch.no_grad():
-            self._batch = Lockstep([spec])
-        self.done = 0
-        self.diverged_at: int | None = None
-
-    @torch.no_grad()
-    def advance(self, last: int) -> None:
-        """Run the steps up to ``last``, unless they are done or the trial has diverged.
-
-        Raises
-        ------
-        SpecificationError
-            If ``last`` lies beyond the horizon.
-        """
-        horizon = self._batch.system.horizon
-        if last > horizon:
-            raise SpecificationError(
-                f"step {last} was asked for, but the horizon is {horizon}: raise env.horizon."
-            )
-        while self.done < last and self.diverged_at is None:
-            self._batch.step(self.done)
-            if bool(self._batch.diverged[0]):
-                self.diverged_at = self.done
-            else:
-                self.done += 1
-
-    @property
-    def parameters(self) -> Array:
-        """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.theta[0].numpy()
-        return parameters
-
-    @property
-    def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
-        states: Array = self._batch.states[0].numpy()
-        return states
-
-
 class ReferenceSteps:
     """The steps of a trial one by one: the caller says what state a plant has and what follows.
 
@@ -594,8 +511,7 @@ class ReferenceSteps:
     @property
     def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.theta[0].numpy().copy()
-        return parameters
+        return self._batch.theta[0].numpy().copy()
 
     def begin(self, t: int, state: Array) -> None:
         """Let step t begin at a state, (d,), whatever came before it."""
@@ -638,14 +554,10 @@ class ReferenceSteps:
 
         Returns whether the parameters are finite.
         """
-        self._batch.observe(t, dt)
-        self.errors[t] = self._prediction_error(t)
-        self._batch.learn(t)
-        self._batch.inform(t)
-        return bool(self._batch.theta.isfinite().all())
-
-    def _prediction_error(self, t: int) -> float:
-        """Return ‖y_t - a_θ(x_t)‖ before it is learned."""
         batch = self._batch
+        batch.observe(t, dt)
         predicted = batch.model(batch.theta, batch.sampled_states[:, t : t + 1])
-        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted[0, 0]))
+        self.errors[t] = float(torch.linalg.vector_norm(batch.targets[0, t] - predicted[0, 0]))
+        batch.learn(t)
+        batch.inform(t)
+        return bool(batch.theta.isfinite().all())

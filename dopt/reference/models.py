@@ -23,7 +23,7 @@ import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -34,10 +34,9 @@ from torch.nn.utils import parameters_to_vector
 from dopt.algorithm import TIE_MARGIN
 from dopt.errors import SpecificationError
 from dopt.models import MLP, Linear, Model
-from dopt.models.base import Array
 from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
 from dopt.systems.base import System, feature_values, next_state
-from dopt.types import Scalar
+from dopt.types import Array, Scalar
 
 BatchModel = Callable[[Tensor, Tensor], Tensor]
 """a_θ of n trials: parameters (n, q) and states (n, N, d) to accelerations (n, N, r).
@@ -46,20 +45,13 @@ States that are the same for all trials may have 1 in the place of n.
 """
 
 
-@runtime_checkable
-class Networked(Protocol):
-    """A model that is a torch network (:class:`dopt.reference.models.Module`)."""
-
-    def module(self, system: System) -> nn.Module: ...
-
-
 def model_function(system: System, model: Model) -> BatchModel:
     """Return a_θ of a model: a network, or the linear form of physics."""
     if isinstance(model, MLP):
         return mlp_function(system, model)
     if isinstance(model, Linear):
         return linear_function(system)
-    if isinstance(model, Networked):
+    if isinstance(model, Module):
         return network_function(system, model.module(system))
     raise TypeError(f"model {model!r} is no network and not linear: run it in the kernel.")
 
@@ -164,8 +156,7 @@ def linear_function(system: System) -> BatchModel:
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
         offset, *units = (stack(system.accelerations(x.unbind(-1), p)) for p in system.linear_form)
         psi = torch.stack([unit - offset for unit in units], dim=-1)
-        out: Tensor = offset + (psi @ theta[:, None, :, None]).squeeze(-1)
-        return out
+        return offset + (psi @ theta[:, None, :, None]).squeeze(-1)
 
     return accelerations
 
@@ -311,14 +302,8 @@ class Module(Model):
                 f"model.{TARGET} is '{target}', but a class derived from torch.nn.Module is "
                 f"expected: correct the class or the path."
             )
-        check_source("model", target, network, given)
-        model = cls(target=target, source=source_digest(network), arguments=_canonical(given))
-        if given.get("name", model.name) != model.name:
-            raise SpecificationError(
-                f"model.name is '{given['name']}', but {target} is called '{model.name}': leave "
-                f"model.name out, or correct it."
-            )
-        return model
+        check_source("model", target, network, given, target.rpartition(".")[2])
+        return cls(target=target, source=source_digest(network), arguments=_canonical(given))
 
     def to_section(self) -> dict[str, object]:
         """Return the section from which :meth:`from_section` makes this model."""
@@ -330,7 +315,7 @@ class Module(Model):
         given = {SOURCE: self.source}
         found: Any = imported("model", self.target, given)
         network: type[nn.Module] = found
-        check_source("model", self.target, network, given)
+        check_source("model", self.target, network, given, self.name)
         return network
 
     def module(self, system: System) -> nn.Module:
@@ -393,8 +378,7 @@ def _built(model: Module, n_features: int, n_outputs: int, seed: int) -> nn.Modu
 
 
 def _array(values: torch.Tensor) -> Array:
-    array: Array = values.detach().numpy().astype(np.float64)
-    return array
+    return values.detach().numpy().astype(np.float64)
 
 
 def _wrong(model: Module, expected: str, given: object) -> SpecificationError:

@@ -44,10 +44,6 @@ class Motion:
     accelerations: Array
 
     @property
-    def seconds(self) -> float:
-        return len(self.positions) * self.dt
-
-    @property
     def times(self) -> Array:
         """Time of each row, (T,) [s]."""
         return self.dt * np.arange(len(self.positions), dtype=float)
@@ -204,7 +200,7 @@ class Body:
                 axis = turn @ model.jnt_axis[j]
                 anchor = origin + turn @ model.jnt_pos[j]
                 moved = motion.positions[:, k] - model.qpos0[self.addresses[k]]
-                if model.jnt_type[j] == _HINGE:
+                if model.jnt_type[j] == HINGE:
                     column = np.concatenate([axis, _cross(anchor, axis)], axis=1)
                     turn = turn @ _turns(model.jnt_axis[j], moved)
                     origin = anchor - turn @ model.jnt_pos[j]
@@ -330,7 +326,7 @@ class Contacts:
         return result
 
 
-_HINGE, _SLIDE = 3, 2
+HINGE, SLIDE = 3, 2
 """Types of joints of MuJoCo."""
 
 
@@ -375,23 +371,19 @@ def _skew(vectors: Array) -> Array:
 
 def _cross(a: Array, b: Array) -> Array:
     """Return cross products, (T, 3), in a third of the time of ``numpy.cross``."""
-    result: Array = a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
-    return result
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def _shifted(vector: Array, origin: Array) -> Array:
     """Return the linear part of spatial motions at other origins, (T, 3)."""
-    result: Array = vector[:, 3:] + _cross(vector[:, :3], origin)
-    return result
+    return vector[:, 3:] + _cross(vector[:, :3], origin)
 
 
 def _crossed(velocity: Array, column: Array) -> Array:
     """Return the rate of a motion that moves with a velocity, (T, 6)."""
     spin, speed = velocity[:, :3], velocity[:, 3:]
-    angular = _cross(spin, column[:, :3])
-    return np.concatenate(
-        [angular, _cross(speed, column[:, :3]) + _cross(spin, column[:, 3:])], axis=1
-    )
+    linear = _cross(speed, column[:, :3]) + _cross(spin, column[:, 3:])
+    return np.concatenate([_cross(spin, column[:, :3]), linear], axis=1)
 
 
 def _turns(axis: Array, angles: Array) -> Array:
@@ -411,15 +403,12 @@ def rotation(quaternion: Array) -> Array:
 
 
 def _driven_joints(model: mujoco.MjModel) -> list[int]:
-    free = [j for j in range(model.njnt) if model.jnt_type[j] in (_HINGE, _SLIDE)]
+    free = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
     if not model.nu:
         return free
-    by_joint = {int(model.actuator_trnid[a, 0]) for a in range(model.nu) if _of_joint(model, a)}
+    of_joints = np.isin(model.actuator_trntype, (0, 1))  # of a joint, or in its parent's frame
+    by_joint = {int(j) for j in model.actuator_trnid[of_joints, 0]}
     return [j for j in free if j in by_joint] or free
-
-
-def _of_joint(model: mujoco.MjModel, actuator: int) -> bool:
-    return int(model.actuator_trntype[actuator]) in (0, 1)  # joint, or joint in its parent's frame
 
 
 def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
@@ -434,9 +423,9 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
     held = model.njnt - len(ids)
     left = {
-        f"{held} joints that no actuator drives stay where the file puts them": held,
-        f"{model.ntendon} tendons are left out": model.ntendon,
-        f"{model.neq} equality constraints are left out": model.neq,
+        f"joints without an actuator, which stay where the file puts them: {held}": held,
+        f"tendons that are left out: {model.ntendon}": model.ntendon,
+        f"equality constraints that are left out: {model.neq}": model.neq,
     }
     return [text for text, count in left.items() if count]
 
@@ -458,6 +447,3 @@ def without_meshes(source: Path) -> mujoco.MjSpec:
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
     return spec
-
-
-__all__ = ["INERTIAL", "Body", "Motion", "inertial_row", "rotation", "without_meshes"]

@@ -203,8 +203,7 @@ def _friction(body: Body, limits: Limits) -> Array:
     """Return the friction of each joint at its limit of velocity, or a typical one, (n,)."""
     model = body.model
     own = model.dof_frictionloss[body.dofs] + model.dof_damping[body.dofs] * limits.velocity
-    result: Array = np.where(own > 0.0, own, 0.1 * limits.torque)
-    return result
+    return np.where(own > 0.0, own, 0.1 * limits.torque)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,12 +315,11 @@ def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
     problem.reference = np.ones(problem.count)
     drawn = [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(REFERENCES)]
     problem.reference = np.median([one.errors for one in drawn], axis=0)
-    found = (dataclasses.replace(one, score=problem.score(*_judged(one))) for one in drawn)
+    found = (
+        dataclasses.replace(one, score=problem.score(one.determinant, one.errors, one.broken))
+        for one in drawn
+    )
     return min(found, key=lambda one: one.score)
-
-
-def _judged(one: Candidate) -> tuple[float, Array, float]:
-    return one.determinant, one.errors, one.broken
 
 
 def _said(one: Candidate) -> str:
@@ -432,6 +430,3 @@ def _states(problem: Problem, rng: np.random.Generator) -> Motion:
     strains = np.abs(problem.body.torques(Motion(1.0, q, v, a)) / limits.torque).max(axis=1)
     kept = np.flatnonzero(strains <= 1.0)[:POOL]
     return Motion(1.0, q[kept], v[kept], a[kept])
-
-
-__all__ = ["Candidate", "Design", "Problem", "attainable", "multisine", "receding", "searched"]

@@ -216,9 +216,9 @@ class RobotExplorer:
         if not self._asked:
             raise ExplorationError("tell was called before ask, but each follows one: ask first.")
         after = arguments.numbers("q_next", q_next, self.body.n)
-        torque = (
-            self._torque if applied is None else arguments.numbers("applied", applied, self.body.n)
-        )
+        torque = self._torque
+        if applied is not None:
+            torque = arguments.numbers("applied", applied, self.body.n)
         self._asked = False
         self._due = None if self._due is None else self._due + self.dt
         self._check_time(time)
@@ -329,16 +329,13 @@ class RobotExplorer:
             return 0.0, float(self._wary[j] * least)
         self._wary[j] = False
         speeds, start, hold, rising = speeds[fits], start[fits], hold[fits], rising[fits]
-        rows = learner.model.jacobian(
-            np.broadcast_to(learner.mean[j : j + 1, :p], (1, p)), speeds[None]
-        )[0]
+        rows = learner.model.jacobian(learner.mean[j : j + 1, :p], speeds[None])[0]
         features = _mean_features(start, start + u[fits] * hold)
         X = np.concatenate([rows, features], axis=1)
         covariance = learner.covariance[j]
         spread = X @ covariance
-        variance = 1.0 / np.maximum(hold / learner.window.seconds - 0.5, 0.5) + (X * spread).sum(
-            axis=1
-        )
+        windows = np.maximum(hold / learner.window.seconds - 0.5, 0.5)
+        variance = 1.0 / windows + (X * spread).sum(axis=1)
         # Variances of the curve, and what the segment takes from them; the widest count most.
         curve = learner.rows(SPEEDS)[j, :-2]
         before = ((curve @ covariance[:p, :p]) * curve).sum(axis=1)
@@ -388,8 +385,7 @@ class RobotExplorer:
             self._away = AWAY
             return None
         demand = mass @ self._a + bias + friction
-        torque: Array = np.minimum(np.maximum(demand, -limits.torque), limits.torque)
-        return torque
+        return np.minimum(np.maximum(demand, -limits.torque), limits.torque)
 
     # What a window teaches.
 
@@ -445,8 +441,7 @@ class RobotExplorer:
         """Return torques by mass and first moment on the last body, (k, n, 4), parts of limits."""
         q, v, a = (np.array([means[i] for means in windows]) for i in range(3))
         rows = self.body.regressor(Motion(self.learner.window.seconds, q, v, a))[:, :, -10:-6]
-        result: Array = rows / self.limits.torque[:, None]
-        return result
+        return rows / self.limits.torque[:, None]
 
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
@@ -526,6 +521,3 @@ def _mean_features(start: Array, end: Array) -> Array:
     cosines, sines = np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)
     result: Array = np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2)
     return result
-
-
-__all__ = ["INPUTS", "RobotExplorer"]

@@ -262,8 +262,7 @@ class FrictionLearner:
         return np.where(moving, missing, np.nan), rows, variance
 
     def _spread(self, rows: Array) -> Array:
-        result: Array = np.squeeze(self.covariance @ rows[..., None], 2)
-        return result
+        return np.squeeze(self.covariance @ rows[..., None], 2)
 
     def learn(self, means: tuple[Array, Array, Array, Array], rates: Array | None = None) -> Array:
         """Learn from a window; return its standardised innovations, (n,), NaN where it is slow.
@@ -363,13 +362,3 @@ def _with_constants(columns: Array) -> Array:
     half, full = columns[:, -2].copy(), columns[:, -1].copy()
     columns[:, -2], columns[:, -1] = 2.0 * half - full, 2.0 * (full - half)
     return columns
-
-
-__all__ = [
-    "FRICTION",
-    "SPEEDS",
-    "CoulombViscous",
-    "FrictionLearner",
-    "FrictionModel",
-    "Network",
-]

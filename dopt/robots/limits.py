@@ -68,6 +68,7 @@ class Limits:
         given = {} if file is None else _given(body, Path(file))
         values: dict[str, list[Any]] = {kind: [] for kind in KINDS}
         assumed = []
+        missing: dict[str, tuple[str, ...]] = dict.fromkeys(KINDS, ())
         for j, name in enumerate(body.joints):
             for kind in KINDS:
                 value = given.get((name, kind), own[kind][j])
@@ -75,11 +76,11 @@ class Limits:
                     value = values["velocity"][-1] / STOPPING
                     assumed.append(name)
                 if value is None:
-                    raise SpecificationError(
-                        f"joint '{name}' has no limit of its {kind}, but one is expected: give a "
-                        f"file of limits with 'joints: {{{name}: {{{kind}: …}}}}'."
-                    )
+                    missing[kind] += (name,)
+                    value = math.nan
                 values[kind].append(value)
+        if any(missing.values()):
+            raise _missing(body, missing)
         arrays = {kind: np.array(value, dtype=float) for kind, value in values.items()}
         notes = [*_suspicious(body, arrays, given)]
         if assumed:
@@ -105,10 +106,28 @@ class Limits:
         }
         return parts if torques is None else parts | {"torque": torques / self.torque}
 
-    def shares(self, motion: Motion, torques: Array | None = None) -> dict[str, float]:
+    def shares(self, motion: Motion) -> dict[str, float]:
         """Return the largest share of each kind of limit that a motion takes; 1 is the limit."""
-        parts = self.parts(motion, torques)
+        parts = self.parts(motion)
         return {kind: float(np.abs(part).max()) for kind, part in parts.items()}
+
+
+def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> SpecificationError:
+    """Return the error for limits that no file gives, with the lines that are to be filled in."""
+    lacking = {kind: names for kind, names in missing.items() if names}
+    said = "; ".join(f"{kind} of {_listed(list(names))}" for kind, names in lacking.items())
+    every = {kind for kind, names in lacking.items() if len(names) == body.n}
+    lines = ["joints:"]
+    for name in ("default", *body.joints):
+        kinds = every if name == "default" else {k for k, n in lacking.items() if name in n} - every
+        if kinds:
+            blanks = [f"{k}: {'[…, …]' if k == 'position' else '…'}" for k in KINDS if k in kinds]
+            lines.append(f"  {name}: {{{', '.join(blanks)}}}")
+    return SpecificationError(
+        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N): "
+        f"{said}. Fill in these lines, and give them as a file of limits (--limits FILE):\n"
+        + "\n".join(lines)
+    )
 
 
 def _own(body: Body) -> dict[str, list[Any]]:
@@ -227,6 +246,3 @@ def _unlike(source: Path, what: str, value: object, expected: str) -> Specificat
     return SpecificationError(
         f"{what} in {source} is {value!r}, but {expected} is expected: correct it."
     )
-
-
-__all__ = ["KINDS", "Limits"]

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.optimize
 
 from dopt.errors import SpecificationError, unknown_name
-from dopt.robots.body import INERTIAL, Body, Motion, inertial_row, rotation
+from dopt.robots.body import INERTIAL, SLIDE, Body, Motion, inertial_row, rotation
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -37,6 +37,8 @@ UNITS = {
     **{"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "armature": "kg m²"},
     **{"damping": "N m s/rad", "frictionloss": "N m", "gear": ""},
 }
+OF_SLIDES = {"armature": "kg", "damping": "N s/m", "frictionloss": "N"}
+"""Units of the kinds of parameters; a joint that slides has ``OF_SLIDES``."""
 
 FRICTION = 0.05
 """Share of the limit of torque that friction is taken to be where the file has none."""
@@ -71,20 +73,18 @@ class Parameter:
         Nominal value.
     scale : float
         Size that errors are relative to: the nominal value, or a typical one where that is 0.
+    unit : str
     """
 
     kind: str
     place: str
     value: float
     scale: float
+    unit: str
 
     @property
     def name(self) -> str:
         return f"{self.kind}:{self.place}"
-
-    @property
-    def unit(self) -> str:
-        return UNITS[self.kind]
 
 
 class Unknowns:
@@ -196,10 +196,12 @@ class Unknowns:
         return found
 
     def _parameter(self, kind: str, place: str) -> Parameter:
-        model = self.body.model
+        model, unit = self.body.model, UNITS[kind]
         if kind in OF_JOINTS:
             k = self.body.joints.index(place)
             dof = self.body.dofs[k]
+            if model.jnt_type[model.dof_jntid[dof]] == SLIDE:
+                unit = OF_SLIDES.get(kind, unit)
             typical = FRICTION * self.limits.torque[k]
             value, usual = {
                 "armature": (model.dof_armature[dof], 0.1 * self._inertia(k)),
@@ -207,18 +209,18 @@ class Unknowns:
                 "frictionloss": (model.dof_frictionloss[dof], typical),
                 "gear": (1.0, 1.0),
             }[kind]
-            return Parameter(kind, place, float(value), float(value or usual))
+            return Parameter(kind, place, float(value), float(value or usual), unit)
         b = self.body.moved[self.body.bodies.index(place)]
         mass, moments = float(model.body_mass[b]), np.array(model.body_inertia[b])
         if kind == "mass":
-            return Parameter(kind, place, mass, mass or 1.0)
+            return Parameter(kind, place, mass, mass or 1.0, unit)
         axis = "xyz".index(kind[-1])
         if kind.startswith("com"):
             # A centre at 0 has the size of the body, by its radius of gyration.
             away = np.linalg.norm(model.body_ipos[b])
             size = max(float(np.sqrt(moments.mean() / max(mass, 1e-9))), float(away), 1e-3)
-            return Parameter(kind, place, float(model.body_ipos[b][axis]), size)
-        return Parameter(kind, place, float(moments[axis]), float(moments[axis]) or 1e-3)
+            return Parameter(kind, place, float(model.body_ipos[b][axis]), size, unit)
+        return Parameter(kind, place, float(moments[axis]), float(moments[axis]) or 1e-3, unit)
 
     def _inertia(self, k: int) -> float:
         """Return the inertia that joint ``k`` moves at home."""
@@ -257,13 +259,11 @@ class Unknowns:
             else:
                 moved = motion.accelerations if one.kind == "armature" else motion.velocities
                 result[:, k, i] = moved[:, k]
-        scaled: Array = result * self.scales
-        return scaled
+        return result * self.scales
 
     def _signs(self, motion: Motion) -> Array:
         """Return the signs of the velocities, smooth about 0, (T, n)."""
-        result: Array = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
-        return result
+        return np.tanh(motion.velocities / (SLOW * self.limits.velocity))
 
     def _inertial_directions(self, places: list[int]) -> Array:
         """Return the change of the inertial parameters with each unknown one, (10 · bodies, p)."""
@@ -297,8 +297,7 @@ class Unknowns:
             Independent measurements of each torque in a second [Hz].
         """
         flat = self.weighted(motion, rate, rigid).reshape(-1, len(self))
-        result: Array = flat.T @ flat
-        return result
+        return flat.T @ flat
 
     def weighted(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the regressor in units of the noise, (T, n, p), as of ``rate`` rows a second."""
@@ -367,8 +366,7 @@ def _null_space(rows: Array) -> tuple[Array, Array]:
 def relative_errors(information: Array) -> Array:
     """Return standard errors with a prior of standard deviation 1, (p,)."""
     covariance = np.linalg.inv(information + np.eye(len(information)))
-    result: Array = np.sqrt(np.diag(covariance))
-    return result
+    return np.sqrt(np.diag(covariance))
 
 
 def _sparse(rows: Array) -> Array:
@@ -425,6 +423,3 @@ def _times(factor: float) -> str:
     text = f"{abs(factor):.3g}"
     sign = "−" if factor < 0 else ""
     return sign if text == "1" else f"{sign}{text} · "
-
-
-__all__ = ["Identifiability", "Parameter", "Unknowns", "count_null", "relative_errors"]

@@ -118,6 +118,3 @@ def _first_state(body: Body, model: Any, times: Array, positions: Array) -> Arra
     qvel[body.dofs] = fit[-2]
     result: Array = sysid.create_initial_state(model, qpos, qvel)
     return result
-
-
-__all__ = ["sequences"]

@@ -122,8 +122,7 @@ class Tracker:
         """Return torques [N m], (n,), that follow a reference, within their limits."""
         wanted = a + BANDWIDTH**2 * (q - self.q) + 2.0 * BANDWIDTH * (v - self.v)
         demand = self.known.inverse(self.q, self.v, wanted) + self.friction(v)
-        clipped: Array = np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
-        return clipped
+        return np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
 
     def lag(self, torque: Array) -> Array:
         """Return the error of position, (n,), that feeds back a torque [N m], (n,).
@@ -201,6 +200,3 @@ def possible_acceleration(
         least = np.minimum(least, np.maximum(share * limits.torque - held, 0.0) / own)
         largest = np.maximum(largest, own)
     return least, largest
-
-
-__all__ = ["BANDWIDTH", "Guard", "KnownBody", "Tracker", "possible_acceleration"]

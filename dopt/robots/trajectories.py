@@ -78,8 +78,7 @@ class Family(ABC):
     def _centres(self, numbers: Array) -> Array:
         """Return the positions about which joints move, (n,): the middle third of the ranges."""
         half = ROOM * np.diff(self.limits.position, axis=1)[:, 0] / 2.0
-        result: Array = self.limits.middle + half / 3.0 * np.tanh(numbers)
-        return result
+        return self.limits.middle + half / 3.0 * np.tanh(numbers)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,6 +306,3 @@ def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
     slope = 30.0 * x**2 * (1.0 - x) ** 2
     bend = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
     return w, sign * slope, bend / ramp**2
-
-
-__all__ = ["Family", "Fourier", "JointPath", "Ladder", "Multisine"]

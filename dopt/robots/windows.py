@@ -93,8 +93,4 @@ def half_widths(errors: Array, expected: Array | None, a: float) -> Array:
         return EARLY * a * errors
     information = 1.0 / np.maximum(errors, 1e-300) ** 2
     later = np.sqrt((a**2 + np.log(np.maximum(information / expected, 1.0))) / information)
-    result: Array = np.where(information < expected, a * np.sqrt(expected) / information, later)
-    return result
-
-
-__all__ = ["WINDOW", "Window", "boundary", "half_widths", "window_size"]
+    return np.where(information < expected, a * np.sqrt(expected) / information, later)

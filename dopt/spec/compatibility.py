@@ -116,12 +116,10 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     _check_model(system, policy, model, learner)
     _check_inputs(system, policy, model, learner)
     if not _teaches(type(learner), type(model)):
-        raise mismatch(
-            f"learner '{learner.name}'",
-            f"{_taught(learner)} and {given} with {_teachers(model)}",
-            "the two together",
-            "were",
-        )
+        taught = [name for name, one in MODELS.items() if _teaches(type(learner), one)]
+        teachers = [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
+        expected = f"{_choice('model', taught)} and {given} with {_choice('learner', teachers)}"
+        raise mismatch(f"learner '{learner.name}'", expected, "the two together", "were")
     fits = not isinstance(learner, GaussNewton) or learner.refit_every == 1
     if isinstance(model, Ensemble) and not fits:
         # a filter between two fits would keep the M of one network
@@ -218,16 +216,6 @@ def _teaches(learner: type[Learner], model: type[Model]) -> bool:
     return filtered or fitted or learner.structure == model.structure
 
 
-def _taught(learner: Learner) -> str:
-    return _choice("model", [name for name, one in MODELS.items() if _teaches(type(learner), one)])
-
-
-def _teachers(model: Model) -> str:
-    return _choice(
-        "learner", [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
-    )
-
-
 def _choice(kind: str, names: list[str]) -> str:
     *others, last = map(repr, names)
     return f"{kind} {', '.join(others)} or {last}" if others else f"{kind} {last}"
@@ -275,6 +263,12 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
 
 def _check_unknown(system: System, model: GreyBox) -> None:
     """Check that a grey box has unknown parameters, each of the system's and with one guess."""
+    if isinstance(system, ExploredPlant):  # whose accelerations are NaN
+        expected = (
+            "accelerations that are equations (of a plant, learner 'simulation_error' estimates "
+            "the constants that are dopt.unknown())"
+        )
+        raise mismatch("model 'grey_box'", expected, f"env '{system.name}'")
     names = model.names(system)
     if not names or len(set(names)) < len(names) or not set(names) <= set(system.physical):
         expected = f"names out of {', '.join(system.physical) or 'none'}, none of them twice"
@@ -329,19 +323,15 @@ def _check_information(
             raise mismatch(f"policy.refresh_every {policy.refresh_every}", what, given)
         return
     if model.structure != "gradient":
-        raise mismatch(what, _models("gradient"), f"model '{model.name}'")
+        fitting = [name for name, one in MODELS.items() if one.structure == "gradient"]
+        raise mismatch(what, _choice("model", fitting), f"model '{model.name}'")
     if learner.updates_information:
         raise mismatch(what, "a learner that leaves M to the policy", f"learner '{learner.name}'")
     q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
     form = policy.chosen_form(q, n_rows)
     if form != "primal":
-        expected = "policy.form 'primal' or 'auto'" if hasattr(policy, "form") else "form 'primal'"
-        found = f"policy.form '{form}'" if hasattr(policy, "form") else f"form '{form}'"
-        raise mismatch(what, expected, found)
-
-
-def _models(structure: str) -> str:
-    return _choice("model", [name for name, one in MODELS.items() if one.structure == structure])
+        whose, auto = ("policy.", " or 'auto'") if hasattr(policy, "form") else ("", "")
+        raise mismatch(what, f"{whose}form 'primal'{auto}", f"{whose}form '{form}'")
 
 
 def check_sampled(system: System, model: Model) -> None:

@@ -162,8 +162,11 @@ class TrialConfig:
         self._check_runnable()
         if self.limits is not None:
             self.limits.check(self.system)
-            if self.system.n_measured and self.limits.enforced:
-                self._check_estimates()
+            estimated = self.system.n_measured and self.limits.enforced
+            if estimated and not isinstance(self.learner, JointKalman):
+                expected = "learner 'joint_ekf', which knows how uncertain its estimates are"
+                given = f"learner '{self.learner.name}'"
+                raise mismatch("limits of measured states", expected, given)
         if type(self.system) not in SYSTEMS.values():
             check_system(self.system)
             warn_of_scale(self.system, self.model)
@@ -186,21 +189,13 @@ class TrialConfig:
         if self.sample_loss:
             _ = self.process
 
-    def _check_estimates(self) -> None:
-        """Refuse limits where nobody says how uncertain the estimated states are."""
-        if not isinstance(self.learner, JointKalman):
-            expected = "learner 'joint_ekf', which knows how uncertain its estimates are"
-            given = f"learner '{self.learner.name}'"
-            raise mismatch("limits of measured states", expected, given)
-
     def _check_runnable(self) -> None:
         """Refuse users' parts that no path can run, and on the kernel what it lacks."""
         for part, registry, bases in (
             (self.policy, POLICIES, (OpenLoop, CustomPolicy, CompiledPolicy)),
             (self.learner, LEARNERS, (CustomLearner, CompiledLearner)),
         ):
-            shipped: Collection[type] = registry.values()
-            if type(part) not in shipped and not isinstance(part, bases):
+            if type(part) not in [*registry.values()] and not isinstance(part, bases):
                 derived = " or ".join(base.__name__ for base in bases)
                 raise SpecificationError(
                     f"{part.section} is a {type(part).__name__} of your own, which brings nothing "
@@ -294,7 +289,8 @@ class TrialConfig:
             content["limits"] = written(self.limits)
         if self.sample_loss:
             content["assess"] = {"sample_loss": True}
-        if self._scales_criterion():
+        learner, compared = self.learner, isinstance(self.policy, (Search, GradientDOptimal))
+        if compared and isinstance(learner, InformationLearner) and learner.noise_variance != 1.0:
             content["criterion_version"] = CRITERION_VERSION
         if self.system.horizon > LONGEST_RUN:
             content["reachable_version"] = REACHABLE_VERSION
@@ -312,13 +308,6 @@ class TrialConfig:
         q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
         held = held_information(policy, learner, q, n_rows)
         return bool(held and held.form == "sketch" and q <= EQUAL_COST * n_rows)
-
-    def _scales_criterion(self) -> bool:
-        """Return True if plans are compared by a criterion that depends on ρ, and ρ is not 1."""
-        if not isinstance(self.policy, (Search, GradientDOptimal)):
-            return False
-        learner = self.learner
-        return isinstance(learner, InformationLearner) and learner.noise_variance != 1.0
 
     @functools.cached_property
     def key(self) -> str:
@@ -425,7 +414,8 @@ def _named(flat: Flat, usual: Flat, differing: set[str]) -> set[str]:
 
 def _label(flat: Flat, paths: Collection[str], titled: bool, digits: int = 6) -> str:
     words = _words(flat, [path for path in _paths([flat]) if path in paths], digits)
-    return ", ".join([_title(flat), *words] if titled or not words else words)
+    title = policy_title(str(flat.get("policy.name", flat.get("policy", ""))))
+    return ", ".join([title, *words] if titled or not words else words)
 
 
 def limits_label(config: Mapping[str, object]) -> str:
@@ -504,10 +494,6 @@ def _default_section(cls: type[Validated], env: type[Validated] | None) -> Mappi
     return {key: value for key, value in own.items() if key not in ("name", SOURCE, TARGET)}
 
 
-def _title(flat: Flat) -> str:
-    return policy_title(str(flat.get("policy.name", flat.get("policy", ""))))
-
-
 def _paths(flats: Sequence[Flat]) -> list[str]:
     """Return all paths that a label can name, the model and the learner first.
 
@@ -529,9 +515,8 @@ def _words(flat: Flat, paths: Sequence[str], digits: int = 6) -> list[str]:
 
 def _word(path: str, value: object, digits: int = 6) -> str:
     name = path.rpartition(".")[2]
-    return _FORMATS.get(path, "{}" if name == "name" else f"{name}={{}}").format(
-        _text(value, digits)
-    )
+    form = _FORMATS.get(path, "{}" if name == "name" else f"{name}={{}}")
+    return form.format(_text(value, digits))
 
 
 def _text(value: object, digits: int) -> str:

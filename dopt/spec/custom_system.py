@@ -72,13 +72,13 @@ def warn_of_sizes(
     of these, which the box of a plant decides about.
     """
     found = 0
+    remedy = "measure that state in a unit"
+    if units is not None:
+        remedy = "declare a half-width of the box of that state"
     for k, (row, size) in enumerate(zip(system.learned_rows, sizes, strict=True)):
         if size > LARGEST or 0 < size < SMALLEST:
             found += 1
             unit = 1.0 if units is None else units[k]
-            remedy = "measure that state in a unit"
-            if units is not None:
-                remedy = "declare a half-width of the box of that state"
             warnings.warn(
                 f"The learned acceleration of {system.state_labels[row]} in env '{system.name}' "
                 f"has a root mean square of {size * unit:.3g} {where}, but a network learns one of "
@@ -115,14 +115,13 @@ def check_names(system: System) -> None:
             )
     for name in system.linear_parameters:
         if name not in system.physical:
+            remedy = "it has none, so leave it out."
+            if system.physical:
+                remedy = suggestion(name, system.physical)
             raise SpecificationError(
                 f"linear_parameters of env '{system.name}' names '{name}', but names of its "
-                f"physical parameters are expected: {_choice(name, system.physical)}"
+                f"physical parameters are expected: {remedy}"
             )
-
-
-def _choice(name: str, physical: tuple[str, ...]) -> str:
-    return suggestion(name, physical) if physical else "it has none, so leave it out."
 
 
 def check_linear(system: System, points: Array) -> None:
@@ -255,8 +254,8 @@ def check_system(system: System) -> None:
     states = rng.uniform(-1, 1, (system.n_states, STATES))
     inputs = rng.uniform(-1, 1, (system.n_inputs, STATES))
     points = np.concatenate([states, inputs]) if system.reads_inputs else states
-    _tried(system, "accelerations", system.n_learned, tuple(points))
-    _tried(system, "known", system.n_states, tuple(states), tuple(inputs))
+    _try(system, "accelerations", system.n_learned, tuple(points))
+    _try(system, "known", system.n_states, tuple(states), tuple(inputs))
     check_finite(system)
     check_linear(system, points)
     if not input_effect(system).is_affine:
@@ -340,9 +339,10 @@ def _check_indices(system: System) -> None:
             )
 
 
-def _tried(system: System, what: str, size: int, *arguments: Sequence[Any]) -> Array:
-    """Return what an equation gives for many states at once, (size, STATES)."""
+def _try(system: System, what: str, size: int, *arguments: Sequence[Any]) -> None:
+    """Refuse an equation that does not give so many numbers for many states at once."""
     equation: Callable[..., Any] = getattr(system, what)
+    entry = "state" if what == "known" else "learned row"
     try:
         with np.errstate(all="ignore"):
             values = equation(*arguments, system.parameters)
@@ -359,15 +359,14 @@ def _tried(system: System, what: str, size: int, *arguments: Sequence[Any]) -> A
     if single:
         raise SpecificationError(
             f"{what}() of env '{system.name}' returns one number, but a tuple of {size} is "
-            f"expected, one for each {_entry(what)}: return {'a,' if size == 1 else 'a, b, ...'} "
+            f"expected, one for each {entry}: return {'a,' if size == 1 else 'a, b, ...'} "
             f"with its comma{'' if size == 1 else 's'}."
         )
     if len(found) != size:
         raise SpecificationError(
             f"{what}() of env '{system.name}' returns {len(found)} numbers, but {size} are "
-            f"expected, one for each {_entry(what)}: correct it."
+            f"expected, one for each {entry}: correct it."
         )
-    return found
 
 
 def _is_single(values: Any, size: int) -> bool:
@@ -375,7 +374,3 @@ def _is_single(values: Any, size: int) -> bool:
     if isinstance(values, np.ndarray) and values.ndim:
         return values.shape == (STATES,) and size != STATES
     return isinstance(values, int | float | np.generic | np.ndarray)
-
-
-def _entry(what: str) -> str:
-    return "state" if what == "known" else "learned row"

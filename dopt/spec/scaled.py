@@ -23,7 +23,7 @@ from dopt.control.planning import Accelerations
 from dopt.learning import LEARNERS, GaussNewton
 from dopt.limits import Limits, names_of
 from dopt.models import MODELS
-from dopt.policies import POLICIES, Policy, TaskOptimal
+from dopt.policies import POLICIES, TaskOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import ExploredPlant
@@ -76,16 +76,11 @@ class Scaled:
     @functools.cached_property
     def accelerations(self) -> Array:
         """What its learned accelerations are multiplied by, (r,), in units of the plant."""
-        learned: Array = self.states[list(self.system.learned_rows)]
-        return learned
+        return self.states[list(self.system.learned_rows)]
 
     def scaled_predictions(self, predict: Accelerations) -> Accelerations:
         """Return a function of scaled numbers for one in the units of the plant."""
-
-        def scaled_predict(states: Array, inputs: Array) -> Array:
-            return predict(states * self.states, inputs * self.inputs) / self.accelerations
-
-        return scaled_predict
+        return lambda x, u: predict(x * self.states, u * self.inputs) / self.accelerations
 
 
 @functools.lru_cache(maxsize=64)
@@ -119,20 +114,12 @@ def scaled_trial(spec: TrialSpec) -> TrialSpec:
     found = scaled(spec.system)
     if not found.is_scaled:
         return spec
-    config = dataclasses.replace(
-        spec.config,
-        system=found.system,
-        policy=_scaled_policy(spec.policy, found),
-        limits=spec.limits and _scaled_limits(spec.limits, found),
-    )
-    return TrialSpec(config, spec.seed)
-
-
-def _scaled_policy(policy: Policy, found: Scaled) -> Policy:
+    policy, limits = spec.policy, spec.limits and _scaled_limits(spec.limits, found)
     if isinstance(policy, TaskOptimal) and policy.goal:
         goal = found.of_states(np.array(policy.goal))
-        return dataclasses.replace(policy, goal=tuple(goal.tolist()))
-    return policy
+        policy = dataclasses.replace(policy, goal=tuple(goal.tolist()))
+    config = dataclasses.replace(spec.config, system=found.system, policy=policy, limits=limits)
+    return TrialSpec(config, spec.seed)
 
 
 def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
@@ -142,13 +129,9 @@ def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
     def divided(name: str, number: float) -> float:
         return float(rounded(number / units[name])) if math.isfinite(number) else number
 
-    return dataclasses.replace(
-        limits,
-        bounds=tuple(
-            (name, divided(name, low), divided(name, high)) for name, low, high in limits.bounds
-        ),
-        rates=tuple((name, divided(name, rate)) for name, rate in limits.rates),
-    )
+    bounds = tuple((name, divided(name, a), divided(name, b)) for name, a, b in limits.bounds)
+    rates = tuple((name, divided(name, rate)) for name, rate in limits.rates)
+    return dataclasses.replace(limits, bounds=bounds, rates=rates)
 
 
 def learned_accelerations(
@@ -162,5 +145,4 @@ def learned_accelerations(
     found = scaled(spec.system)
     u = None if inputs is None else found.of_inputs(inputs)
     values = spec.model.predict(found.system, parameters, found.of_states(states), u)
-    predicted: Array = values * found.accelerations
-    return predicted
+    return values * found.accelerations

@@ -53,8 +53,9 @@ class TrialSpec(Validated):
             object.__setattr__(self, "seed", int(given))
         whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
         if not whole or not 0 <= self.seed <= LARGEST_SEED:
+            shown = "null" if given is None else repr(self.seed)
             raise SpecificationError(
-                f"seed is {_shown(self.seed)}, but a whole number of 0 or above and below 2^63 is "
+                f"seed is {shown}, but a whole number of 0 or above and below 2^63 is "
                 f"expected: set seed to a whole number in this range."
             )
 
@@ -247,9 +248,7 @@ class TrialSpec(Validated):
         }
 
 
-def _sections(
-    parts: Mapping[str, str | Part],
-) -> dict[str, Part]:
+def _sections(parts: Mapping[str, str | Part]) -> dict[str, Part]:
     return {key: {"name": part} if isinstance(part, str) else part for key, part in parts.items()}
 
 
@@ -272,10 +271,6 @@ def _assesses_samples(section: object) -> bool:
         f"configuration key 'assess' is {section!r}, but a section with sample_loss, true or "
         f"false, is expected: write for instance assess.sample_loss=true."
     )
-
-
-def _shown(value: object) -> str:
-    return "null" if value is None else repr(value)
 
 
 def _check_system(system: object) -> None:
@@ -372,6 +367,10 @@ class MarkedTrial:
         """SHA-256 of the marked configuration with the seed."""
         text = f'{self.config_json[:-1]},"seed":{self.seed}}}'
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def columns(self) -> dict[str, str | int | float | None]:
+        """Return what a table of configurations shows in columns of its own."""
+        raise NotImplementedError
 
 
 def marked_json(content: Mapping[str, object]) -> str:

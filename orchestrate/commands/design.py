@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orchestrate.commands.command import Command, answer
+from orchestrate.commands import Command, answer
 from orchestrate.errors import ExitCode
 from orchestrate.files import whole
 from orchestrate.program import UsageError, integer, path, positive, tell
@@ -151,7 +151,8 @@ def _told(problem: Problem, motion: Motion, errors: np.ndarray) -> dict[str, Any
 
 
 def _said(document: dict[str, Any]) -> list[str]:
-    lines = [f"{document['robot']}: {len(document['joints'])} joints"]
+    count = len(document["joints"])
+    lines = [f"{document['robot']}: {count} joint{'s' if count > 1 else ''}"]
     lines += [f"note: {note}" for note in document["notes"]]
     lines += _listed(document["null"], "combinations that no motion can tell")
     lines += _listed(document["weak"], "parameters with standard errors above 100 %")

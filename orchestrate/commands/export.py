@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from dopt import __version__
 from dopt.errors import DoptError
-from orchestrate.commands.command import Command, add_filters, answer, chosen
-from orchestrate.commands.results import counts
-from orchestrate.errors import ExitCode, without_password
+from orchestrate.commands import Command, add_filters, answer, chosen
+from orchestrate.commands.results import counts, public
+from orchestrate.errors import ExitCode
 from orchestrate.files import whole
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory
-from orchestrate.store.records import now, unpack
+from orchestrate.store.records import now, unpacked_trajectory
 from orchestrate.store.schema import OUTCOME_COLUMNS, trial
 
 if TYPE_CHECKING:
@@ -152,6 +152,7 @@ def _write(
     reader: Reader, configs: Sequence[ConfigRow], wanted: Export, out: Path
 ) -> dict[str, Any]:
     import pyarrow as pa  # other commands do without it
+    from pyarrow import csv, parquet
 
     if wanted.kind == "trajectories":
         columns = _trajectory_columns(reader, configs)
@@ -160,9 +161,15 @@ def _write(
         columns, sql = _SELECTED[wanted.kind]
         tables = _selected(reader, configs, columns, sql)
     kinds = {name: pa.type_for_alias(kind) for name, kind in columns.items()}
-    write = {"csv": _write_csv, "parquet": _write_parquet}[wanted.format]
-    with closing(tables):  # after an error, before the database
-        rows = write(out, pa.schema(kinds), (_batch(kinds, *one) for one in tables))
+    schema, rows = pa.schema(kinds), 0
+    if wanted.format == "csv":
+        writer = csv.CSVWriter(out, schema)
+    else:
+        writer = parquet.ParquetWriter(out, schema, compression="zstd")
+    with closing(tables), writer:  # the tables after an error, before the database
+        for table in _large(schema, (_batch(kinds, *one) for one in tables)):
+            writer.write_table(table)
+            rows += table.num_rows
     return {"rows": rows, "columns": {name: str(kind) for name, kind in kinds.items()}}
 
 
@@ -205,9 +212,7 @@ def _of_config(
 ) -> Iterator[tuple[int, str, Trajectory]]:
     """Yield (seed, status, trajectory) of a configuration; ``size`` of them are read at a time."""
     for rows in reader.batches(size, _TRAJECTORIES, config_key=config.config_key):
-        for seed, status, dtype, *packed in rows:
-            arrays = [unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)]
-            yield seed, status, Trajectory(*arrays)
+        yield from ((seed, status, unpacked_trajectory(*row)) for seed, status, *row in rows)
 
 
 def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
@@ -236,33 +241,17 @@ def _batch(kinds: Mapping[str, pa.DataType], values: Mapping[str, Any], n: int) 
     return pa.RecordBatch.from_arrays(arrays, schema=pa.schema(kinds))
 
 
-def _write_csv(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> int:
-    """Write the rows, missing values empty; return how many."""
-    from pyarrow.csv import CSVWriter
-
-    n = 0
-    with CSVWriter(path, schema) as writer:
-        for batch in batches:
-            writer.write_batch(batch)
-            n += batch.num_rows
-    return n
-
-
-def _write_parquet(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> int:
-    """Write the rows, missing values null; return how many. Many small tables make a slow file."""
+def _large(schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield the rows in tables of many batches: small ones make a slow file of Parquet."""
     import pyarrow as pa
-    from pyarrow.parquet import ParquetWriter
 
-    n, waiting = 0, list[pa.RecordBatch]()
-    with ParquetWriter(path, schema, compression="zstd") as writer:
-        for batch in batches:
-            n += batch.num_rows
-            waiting.append(batch)
-            if sum(one.num_rows for one in waiting) >= 4 * ROWS:
-                writer.write_table(pa.Table.from_batches(waiting))
-                waiting = []
-        writer.write_table(pa.Table.from_batches(waiting, schema))
-    return n
+    waiting = list[pa.RecordBatch]()
+    for batch in batches:
+        waiting.append(batch)
+        if sum(one.num_rows for one in waiting) >= 4 * ROWS:
+            yield pa.Table.from_batches(waiting)
+            waiting = []
+    yield pa.Table.from_batches(waiting, schema)
 
 
 def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> None:
@@ -288,7 +277,7 @@ def provenance(
     """Return database, selection, configurations and launches, without passwords."""
     keys = {config.config_key for config in configs}
     writers = {row.launch_id for row in reader.rows(_WRITERS) if row.config_key in keys}
-    launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
+    launches = [public(one) for one in reader.launches() if one.launch_id in writers]
     return {
         "written": now(),
         "program": f"dopt {__version__}",
@@ -298,13 +287,8 @@ def provenance(
         "trials": dict(counts(configs)),
         "missing_values": "empty in csv, null in parquet: a loss that is not finite",
         "configs": {config.config_key: dict(config.config) for config in configs},
-        "launches": [_public(launch) for launch in launches],
+        "launches": launches,
     }
-
-
-def _public(launch: Mapping[str, Any]) -> dict[str, Any]:
-    words = {name: [*map(without_password, launch[name])] for name in ("argv", "overrides")}
-    return {**launch, **words}
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 
 from dopt.errors import given_path
-from orchestrate.commands.command import Command, add_filters, answer, chosen, plain, say_json, show
+from orchestrate.commands import Command, add_filters, answer, chosen, plain, say_json, show
 from orchestrate.commands.results import ListedTrial, listed, the_one
 from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, length_of_time, path

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from dopt.limits import VIOLATIONS, WORST
 from dopt.spec.config import completed
-from orchestrate.commands.command import (
+from orchestrate.commands import (
     Command,
     add_filters,
     chosen,
@@ -205,11 +205,7 @@ def report(reader: Reader, trial_id: int) -> TrialReport:
     return TrialReport(
         trial=trial,
         config=completed(stored_json(text, dict)),
-        launches=[
-            {name: _public(value) for name, value in asdict(launch).items()}
-            for launch in reader.launches()
-            if launch.launch_id in tried
-        ],
+        launches=[public(one) for one in reader.launches() if one.launch_id in tried],
         attempts=attempts,
         loss=[row[0] for row in reader.rows(_LOSS, trial_id=trial_id)],
         beyond_limits={row[0]: row[1] for row in reader.rows(_BEYOND, trial_id=trial_id)},
@@ -219,8 +215,10 @@ def report(reader: Reader, trial_id: int) -> TrialReport:
     )
 
 
-def _public(value: Any) -> Any:
-    return [without_password(word) for word in value] if isinstance(value, list) else value
+def public(launch: LaunchRow) -> dict[str, Any]:
+    """Return a launch without passwords."""
+    row = asdict(launch)
+    return row | {name: [*map(without_password, row[name])] for name in ("argv", "overrides")}
 
 
 DEFAULT_LIMIT = 1_000

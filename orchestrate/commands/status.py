@@ -15,7 +15,7 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from orchestrate.commands.command import (
+from orchestrate.commands import (
     Command,
     add_filters,
     chosen,
@@ -291,14 +291,13 @@ def _add_work_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_work(arguments: argparse.Namespace) -> ExitCode:
     """Run trials until none is left, the time is over, or a signal comes."""
     from orchestrate.runner.start import Output
-    from orchestrate.runner.worker import WorkerSettings, run_worker
+    from orchestrate.runner.worker import run_worker
 
     Reader.open(arguments.db).close()  # a worker creates no database
-    names = ("processes", "timeout", "memory_gib", "retry_memory")
+    names = ("processes", "timeout", "memory_gib", "retry_memory", "lease")
     given = {name: getattr(arguments, name) for name in names}
-    settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)
-    answer = _to_stderr if arguments.json else say_still
-    code = run_worker(settings, Output(answer, _to_stderr, sys.stderr))
+    output = Output(_to_stderr if arguments.json else say_still, _to_stderr, sys.stderr)
+    code = run_worker(arguments.db, output, seconds=arguments.until, **given)
     if arguments.json:
         say_json({"exit_code": code.value, "complete": code in (0, ExitCode.SOME_FAILED)})
     return code

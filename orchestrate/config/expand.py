@@ -66,7 +66,6 @@ def expand(
     settings: DictConfig,
     *grids: Sequence[str],
     sections: Sequence[str] = TRIAL_SECTIONS,
-    grouped: str = "seed",
     check: Check = reject_unknown,
 ) -> list[Combination]:
     """Return the combinations of one or several grids, of which ``build_grid`` makes trials.
@@ -79,8 +78,6 @@ def expand(
         Overrides that span each grid (:func:`orchestrate.config.options.read_axes`).
     sections
         Top-level keys that the settings of a combination hold.
-    grouped
-        Scalar whose values stay together in one combination, if nothing else depends on it.
     check
         Called with each composed configuration; raises if that is invalid.
 
@@ -89,29 +86,51 @@ def expand(
     SpecificationError
         If an override sets a key that no choice of any grid has.
     """
-    expansion = _Expansion(_Composer(settings), sections, grouped, check)
+    expansion = _Expansion(_Composer(settings), sections, check)
     result: list[Combination] = []
     for arguments in grids:
         axes = read_axes(expansion.composer.loader, arguments)
         fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
         for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
             result.extend(expansion.combinations(axes, _arguments(fixed, picks)))
-    expansion.keys.check_all_used()
+    expansion.check_all_used()
     return result
 
 
 @dataclasses.dataclass
-class _UnusedKeys:
-    """Keys that some choice uses, and choices without a key that is set."""
+class _Expansion:
+    """State shared by the combinations of all choices.
 
+    Attributes
+    ----------
+    used, lacking
+        Keys that some choice uses, and choices, composed without it, that lack a key that is set.
+    """
+
+    composer: _Composer
+    sections: Sequence[str]
+    check: Check
     used: set[str] = dataclasses.field(default_factory=set)
     lacking: dict[str, list[DictConfig]] = dataclasses.field(default_factory=dict)
 
-    def note(self, config: DictConfig, used: Iterable[str], lacking: Iterable[str]) -> None:
-        """Record a choice, composed without the keys that it lacks."""
+    def combinations(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> Iterator[Combination]:
+        """Yield the combinations of one choice of all overrides except swept scalars."""
+        first, lacking = self._compose(axes, fixed)
+        self.check(first)
+        unused = tuple(axis.key for axis in lacking)
+        kept = [axis for axis in axes if axis not in lacking]
+        used = tuple(axis.key for axis in kept if axis.replaces)
         self.used.update(used)
-        for key in lacking:
-            self.lacking.setdefault(key, []).append(config)
+        for key in unused:
+            self.lacking.setdefault(key, []).append(first)
+        scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
+        overrides = tuple(fixed[axis.place] for axis in kept if axis.swept and axis.place in fixed)
+        overlay = _ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
+        if overlay.applicable:
+            found = _overlaid(overlay, scalars, overrides)
+        else:
+            found = self._one_by_one(kept, fixed, scalars)
+        yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
 
     def check_all_used(self) -> None:
         """Refuse a key that no choice has, with the nearest name in its place."""
@@ -126,34 +145,6 @@ class _UnusedKeys:
             targets = (OmegaConf.select(one, f"{holder}.{TARGET}") for one in configs if holder)
             target = next(filter(None, targets), None)
             raise unknown_field(name, target, names) if target else unknown_setting(name, names)
-
-
-@dataclasses.dataclass
-class _Expansion:
-    """State shared by the combinations of all choices."""
-
-    composer: _Composer
-    sections: Sequence[str]
-    grouped: str
-    check: Check
-    keys: _UnusedKeys = dataclasses.field(default_factory=_UnusedKeys)
-
-    def combinations(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> Iterator[Combination]:
-        """Yield the combinations of one choice of all overrides except swept scalars."""
-        first, lacking = self._compose(axes, fixed)
-        self.check(first)
-        unused = tuple(axis.key for axis in lacking)
-        kept = [axis for axis in axes if axis not in lacking]
-        used = tuple(axis.key for axis in kept if axis.replaces)
-        self.keys.note(first, used, unused)
-        scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
-        overrides = tuple(fixed[axis.place] for axis in kept if axis.swept and axis.place in fixed)
-        overlay = _ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
-        if overlay.applicable:
-            found = _overlaid(overlay, scalars, overrides, self.grouped)
-        else:
-            found = self._one_by_one(kept, fixed, scalars)
-        yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
 
     def _compose(
         self, axes: Sequence[Axis], fixed: Mapping[int, str]
@@ -196,10 +187,10 @@ def _in_order(axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[str]:
 
 
 def _overlaid(
-    overlay: _ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...], grouped: str
+    overlay: _ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...]
 ) -> Iterator[Combination]:
-    """Yield one combination per set of values; values of ``grouped`` stay together."""
-    together = [axis for axis in scalars if axis.key == grouped and overlay.free(grouped)]
+    """Yield one combination per set of values; seeds stay together if nothing depends on them."""
+    together = [axis for axis in scalars if axis.key == "seed" and overlay.free("seed")]
     ranges = [range(1 if axis in together else len(axis.texts)) for axis in scalars]
     for picks in itertools.product(*ranges):
         chosen = list(zip(scalars, picks, strict=True))

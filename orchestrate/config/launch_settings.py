@@ -213,20 +213,17 @@ class LaunchSettings:
         launch = section("launch", given["launch"])
         executor = section("executor", given["executor"])
         part = share(launch["share"])
-        place = _place(section("store", given["store"]), part)
         memory_gib = limit("launch.memory_gib", launch["memory_gib"], "GiB")
         retry = launch["retry"]
         if retry is not None and retry not in RETRY:
             raise unknown_name("launch.retry", retry, RETRY)
         return cls(
             executor=text("executor.name", executor["name"]),
-            store_url=place.url,
+            **_place(section("store", given["store"]), part),
             dry_run=flag("launch.dry_run", launch["dry_run"]),
             detach=flag("launch.detach", launch["detach"]),
             fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
             share=part,
-            collect_in=place.folder,
-            collect_seconds=place.seconds,
             retry=cast("Retry | None", retry),
             until=precision("launch.until", launch["until"]),
             workers=count("launch.workers", launch["workers"]),
@@ -242,30 +239,22 @@ class LaunchSettings:
         )
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Database of a launch, and the folder and the times of its copies."""
-
-    url: str
-    folder: Path | None = None
-    seconds: float = 60.0
-
-
-def _place(store: Mapping[str, Any], part: Share | None) -> _Place:
+def _place(store: Mapping[str, Any], part: Share | None) -> dict[str, Any]:
     """Return where results go; a store with a folder for copies holds one share of a grid."""
     url = stripped(text("store.url", store["url"]), "store.url", LaunchError)
     if store.get("folder") is None:
-        return _Place(url)
+        return {"store_url": url}
     if part is None:
         raise wrong("launch.share", None, "with store=shards a share such as 3/20")
     if not url.startswith("sqlite") or not url.endswith(SHARD_SUFFIX):
         raise wrong("store.url", url, "with store=shards a file such as sqlite:////var/tmp/x.db")
     file = f"{url.removesuffix(SHARD_SUFFIX)}.{part}.{socket.gethostname()}{SHARD_SUFFIX}"
     folder = given_path(text("store.folder", store["folder"]), "store.folder", LaunchError)
-    return _Place(file, folder, amount("store.every", store["every"], "seconds"))
+    every = amount("store.every", store["every"], "seconds")
+    return {"store_url": file, "collect_in": folder, "collect_seconds": every}
 
 
-def _lease_and_patience(lease: object, patience: object) -> dict[str, float]:
+def _lease_and_patience(lease: object, patience: object) -> dict[str, Any]:
     """Check that a launch gives up waiting for its database before its lease ends."""
     seconds = {
         "lease": amount("launch.lease", lease, "seconds"),

@@ -213,10 +213,6 @@ EXECUTORS: Mapping[str, str] = {
 """Module of each executor in ``conf/executor/``, imported when a launch names it."""
 
 
-def _accept(_: LaunchSettings) -> None:
-    """Accept all settings."""
-
-
 class Job(Protocol):
     """Job of a batch system, in which workers take the trials from the database."""
 
@@ -262,7 +258,7 @@ class ExecutorFactory:
 
     make: Callable[[LaunchSettings, Run, Prepare | None], Executor] | None
     trials_at_once: Callable[[LaunchSettings], int | None]
-    check: Callable[[LaunchSettings], None] = _accept
+    check: Callable[[LaunchSettings], None] = lambda _: None
     path: str = "kernel"
     in_process: bool = False
     limiting_key: str = "launch.workers"

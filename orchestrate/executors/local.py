@@ -2,24 +2,32 @@
 
 ``concurrent.futures`` breaks the whole pool when one process dies and does not tell which task
 caused it. Here each worker has its own socket, so that only the chunk of a dead worker is lost.
+
+A worker is this module as a program. Chunks arrive on its socket, and outcomes are sent on it one
+by one. A thread reads, so that neither side blocks on a full pipe, and so that the worker ends with
+its driver. A dying process writes its stack to the second descriptor, and until it is ready
+whatever it prints; then that goes to the third one.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import os
+import queue
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from signal import SIGKILL
 
 from dopt.errors import DoptError
-from dopt.process import usable_cores
+from dopt.process import collect_rarely, usable_cores
 from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import (
     Event,
@@ -30,8 +38,18 @@ from orchestrate.executors.base import (
     TaskDone,
     WorkerLost,
     limits_of,
+    run_task,
 )
-from orchestrate.executors.limits import NO_LIMITS, ONE_THREAD, Limits, module_path
+from orchestrate.executors.limits import (
+    NO_LIMITS,
+    ONE_THREAD,
+    Limits,
+    die_with_parent,
+    ended_after,
+    limit_memory,
+    module_path,
+    pin_threads,
+)
 from orchestrate.program import LIMITS, hiding
 
 PREFETCHED_CHUNKS = 2
@@ -210,7 +228,7 @@ class LocalExecutor(Executor):
 
 def _start(*descriptors: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "orchestrate.executors.worker", *map(str, descriptors)],
+        [sys.executable, "-P", "-m", "orchestrate.executors.local", *map(str, descriptors)],
         pass_fds=descriptors,
         stdin=subprocess.DEVNULL,
         stdout=descriptors[1],
@@ -262,7 +280,7 @@ class CrashReport:
         """Return the status for an exit code, negative for a signal; close the file."""
         stack = Path(f"/proc/self/fd/{self.descriptor}").read_text(errors="replace")
         self.close()
-        if code == -SIGKILL and _kills_for_memory() > self._kills:
+        if code == -signal.SIGKILL and _kills_for_memory() > self._kills:
             return ExitStatus("killed by the kernel: out of memory", "out of memory", stack)
         if stack.startswith("Timeout"):  # written by faulthandler
             return ExitStatus("killed: it ignored its time limit", "timeout", stack)
@@ -281,3 +299,63 @@ def _kills_for_memory() -> int:
     except OSError:
         return 0
     return sum(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))
+
+
+HANDLED_BY_DRIVER = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
+"""Ctrl-C, and warnings before a preemption, which some batch systems send to every process."""
+
+
+def main(descriptor: int, crash_report: int, errors: int) -> None:
+    """Run chunks until the driver closes the socket."""
+    for number in HANDLED_BY_DRIVER:
+        signal.signal(number, signal.SIG_IGN)
+    faulthandler.enable(crash_report)
+    die_with_parent()
+    pin_threads()
+    collect_rarely()
+    connection = Connection(descriptor)
+    run: Run
+    limits: Limits
+    run, limits = connection.recv()
+    chunks: queue.SimpleQueue[list[Task]] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(connection, chunks), daemon=True).start()
+    with ended_after(limits, crash_report):
+        pass  # a thread that the system does not give fails the start, and no trial
+    _hand_over(crash_report, errors)
+    connection.send(None)  # ready
+    while True:
+        for task in chunks.get():
+            limit_memory(limits, task.memory_factor)
+            with ended_after(limits, crash_report):
+                finished = run_task(run, task, limits)
+            connection.send(finished)
+        connection.send(None)
+
+
+def _hand_over(crash_report: int, errors: int) -> None:
+    """Print to the standard error of the driver from now on; begin with what was printed so far."""
+    sys.stdout.flush()
+    printed = os.pread(crash_report, os.fstat(crash_report).st_size, 0)
+    os.ftruncate(crash_report, 0)
+    os.lseek(crash_report, 0, os.SEEK_SET)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(errors, stream.fileno())
+    with suppress(OSError):  # nobody reads it any longer
+        os.write(errors, printed)
+
+
+def _read(connection: Connection, chunks: queue.SimpleQueue[list[Task]]) -> None:
+    try:
+        while True:
+            chunks.put(connection.recv())
+    except (EOFError, OSError):
+        os._exit(0)  # the driver is gone: no one would receive the outcome
+    finally:
+        os._exit(1)  # out of memory, perhaps: the worker is useless without this thread
+
+
+if __name__ == "__main__":
+    try:
+        main(*map(int, sys.argv[1:]))
+    except (EOFError, ConnectionError):
+        os._exit(0)

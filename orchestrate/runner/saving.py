@@ -21,6 +21,7 @@ from typing import Any, Self, TypeVar
 
 from dopt import __version__
 from dopt.result import TrialResult
+from dopt.spec.trial import MarkedTrial
 from orchestrate.errors import without_password_in_word
 from orchestrate.executors.base import record_of
 from orchestrate.fingerprint import fingerprint
@@ -32,7 +33,6 @@ from orchestrate.store import (
     Claim,
     DatabaseMovedError,
     LaunchRecord,
-    Registrable,
     Saved,
     Store,
     StoreError,
@@ -228,7 +228,7 @@ class ExplorationSaver:
         self._alive = ExitStack()
         self._last: Saved | None = None
 
-    def save(self, spec: Registrable, result: TrialResult) -> bool:
+    def save(self, spec: MarkedTrial, result: TrialResult) -> bool:
         """Write an exploration or a fit; return False if the database holds more steps of it.
 
         ``wall_seconds`` of the result may be NaN, where the duration is not known.
@@ -247,7 +247,7 @@ class ExplorationSaver:
                 self._end()
                 raise
 
-    def _save(self, store: Store, spec: Registrable, result: TrialResult) -> bool:
+    def _save(self, store: Store, spec: MarkedTrial, result: TrialResult) -> bool:
         if self._launch is None:
             if store.holds_more(spec, result):
                 return False

@@ -530,13 +530,10 @@ def _loss_failure(lost: WorkerLost, times: int) -> Failure:
     if lost.cause == "timeout":
         return Failure("TrialTimeoutError", lost.reason, lost.traceback, lost.cause)
     lost_part, only = ("node was lost", " only") if lost.node_lost else ("worker died", "")
-    message = f"{lost_part} {_times(times)} while running{only} this trial (last: {lost.reason})"
+    often = {1: "once", 2: "twice"}.get(times, f"{times} times")
+    message = f"{lost_part} {often} while running{only} this trial (last: {lost.reason})"
     cause = NODE_LOST if lost.node_lost else lost.cause
     return Failure("WorkerLost", message, lost.traceback, cause)
-
-
-def _times(count: int) -> str:
-    return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
 def _summary(failure: Failure) -> str:

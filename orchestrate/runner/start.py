@@ -64,7 +64,6 @@ COMPILING = "compiling the kernel: this takes up to a minute, and later launches
 
 Say = Callable[[str], None]
 
-
 Preparation = Callable[[Sequence[TrialConfig]], AbstractContextManager[object]]
 """Takes configurations of the kernel, one of each kind; a context manager, which prepares for their
 trials while its block runs and has done so at the block's end."""
@@ -315,7 +314,7 @@ def leave(
     grid: Grid,
     settings: LaunchSettings,
     job: Job | None,
-    say: Callable[[str], None],
+    say: Say,
 ) -> ExitCode:
     """Register the grid for workers, and submit the job in which they run."""
     free_trials(store, grid, settings)
@@ -341,7 +340,7 @@ REST = 20.0
 
 
 @contextmanager
-def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator[None]:
+def collected(settings: LaunchSettings, warn: Say) -> Iterator[None]:
     """Copy the database of the block every ``collect_seconds`` or less often, and once after it.
 
     What earlier launches of the share have collected, perhaps on machines that are gone, is merged
@@ -375,13 +374,11 @@ def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator
     thread.start()
     try:
         yield
-    except DatabaseMovedError:  # another database may have its name
+    except BaseException as error:
         _stop(thread, ended)
-        raise
-    except BaseException:
-        _stop(thread, ended)
-        with suppress(StoreError):  # the first error is the one to report
-            collect(settings.store_url, folder)
+        if not isinstance(error, DatabaseMovedError):  # another database may have its name
+            with suppress(StoreError):  # the first error is the one to report
+                collect(settings.store_url, folder)
         raise
     _stop(thread, ended)
     collect(settings.store_url, folder)

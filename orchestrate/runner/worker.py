@@ -52,53 +52,6 @@ POLL_SECONDS = 1.0
 NOTICE = "\nstopping: trials that do not finish within 2 s are handed back\n"
 
 
-@dataclass(frozen=True)
-class WorkerSettings:
-    """Settings of a worker.
-
-    Attributes
-    ----------
-    url
-        Database, which exists.
-    seconds
-        Time after which nothing is held any more; None until no trial is left.
-    processes
-        Trials at once; None for one on each core that this process may use.
-    timeout, memory_gib, retry_memory, lease
-        As in :class:`orchestrate.config.launch_settings.LaunchSettings`.
-
-    Raises
-    ------
-    LaunchError
-        If ``retry_memory`` raises no limit.
-    """
-
-    url: str
-    seconds: float | None = None
-    processes: int | None = None
-    timeout: float | None = 3600.0
-    memory_gib: float | None = None
-    retry_memory: float | None = None
-    lease: float = 60.0
-
-    def __post_init__(self) -> None:
-        factor("--retry-memory", self.retry_memory, "--memory-gib", self.memory_gib)
-
-    @property
-    def launch(self) -> LaunchSettings:
-        """The settings of the launch that a worker is."""
-        return LaunchSettings(
-            executor="local",
-            store_url=self.url,
-            workers=self.processes or usable_cores(),
-            timeout=self.timeout,
-            memory_gib=self.memory_gib,
-            retry_memory=self.retry_memory,
-            lease=self.lease,
-            patience=min(30.0, self.lease / 2),
-        )
-
-
 class Leave:
     """Reason to start no further trial, a signal or the end of the time; and when to go at once."""
 
@@ -119,19 +72,52 @@ class Leave:
             self._asked = min(self._asked, now)
         return now >= min(self._end, self._asked + FINISHING_SECONDS)
 
-    @property
-    def signalled(self) -> bool:
-        return self._interrupt.stop_requested
 
-
-def run_worker(settings: WorkerSettings, output: Output, work: Work | None = None) -> ExitCode:
+def run_worker(
+    url: str,
+    output: Output,
+    work: Work | None = None,
+    *,
+    seconds: float | None = None,
+    processes: int | None = None,
+    timeout: float | None = 3600.0,
+    memory_gib: float | None = None,
+    retry_memory: float | None = None,
+    lease: float = 60.0,
+) -> ExitCode:
     """Run pending trials of a database until none is left, the time is over or a signal comes.
+
+    Parameters
+    ----------
+    url
+        Database, which exists.
+    output, work
+        Destinations of messages, and functions that run a trial and prepare for it, by default
+        :data:`orchestrate.runner.start.WORK`.
+    seconds
+        Time after which nothing is held any more; None until no trial is left.
+    processes
+        Trials at once; None for one on each core that this process may use.
+    timeout, memory_gib, retry_memory, lease
+        As in :class:`orchestrate.config.launch_settings.LaunchSettings`.
 
     Raises
     ------
+    LaunchError
+        If ``retry_memory`` raises no limit.
     StoreError, InfrastructureError
         As :func:`orchestrate.runner.start.launch_grid`.
     """
+    settings = LaunchSettings(
+        executor="local",
+        store_url=url,
+        workers=processes or usable_cores(),
+        timeout=timeout,
+        memory_gib=memory_gib,
+        retry_memory=factor("--retry-memory", retry_memory, "--memory-gib", memory_gib),
+        lease=lease,
+        patience=min(30.0, lease / 2),
+    )
     repeated = Repetition()
 
     def interrupt(number: int, _: FrameType | None) -> None:
@@ -139,37 +125,36 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
             raise KeyboardInterrupt
 
     with handling(WARNINGS, interrupt):  # as Ctrl-C until trials are claimed
-        launch = settings.launch
         record = launch_record(sys.argv, [], ROOT)
         start = time.monotonic()
         return recorded_launch(
-            launch,
+            settings,
             record,
             output,
-            lambda store: _work(store, settings, launch, work or WORK, output, start),
+            lambda store: _work(store, settings, seconds, work or WORK, output, start),
         )
 
 
 def _work(
     store: RetryingStore,
-    settings: WorkerSettings,
-    launch: LaunchSettings,
+    settings: LaunchSettings,
+    seconds: float | None,
     work: Work,
     output: Output,
     start: float,
 ) -> ExitCode:
     store.alike = True
-    length = _length(settings.seconds, start)
-    slots = launch.workers or 1
-    chunks = StoredChunks(store, launch.chunk_seconds, slots, length, output.warn)
+    length = _length(seconds, start)
+    slots = settings.workers or 1
+    chunks = StoredChunks(store, settings.chunk_seconds, slots, length, output.warn)
     chunks.look()
     output.say(f"{chunks.waiting:,} trials wait, {slots} processes · {store.safe_url}")
     tally = Tally(chunks.left)
     interrupt = Interrupt(WARNINGS, NOTICE, store.hurry)
-    with started(launch, work, chunks.configs, output.warn) as executor, interrupt:
-        leave = Leave(interrupt, _length(settings.seconds, start))
+    with started(settings, work, chunks.configs, output.warn) as executor, interrupt:
+        leave = Leave(interrupt, _length(seconds, start))
         scheduler = Scheduler(
-            store, executor, chunks, tally, leave, retry_memory=launch.retry_memory
+            store, executor, chunks, tally, leave, retry_memory=settings.retry_memory
         )
         with Progress(tally, output.progress) as progress:
             _pull(scheduler, chunks, leave, progress)
@@ -178,7 +163,7 @@ def _work(
     output.say(worked(tally, scheduler, chunks.left, time.monotonic() - start))
     if not chunks.left:
         return ExitCode.SOME_FAILED if tally.failed else ExitCode.DONE
-    return ExitCode.INTERRUPTED if leave.signalled else ExitCode.UNFINISHED
+    return ExitCode.INTERRUPTED if interrupt.stop_requested else ExitCode.UNFINISHED
 
 
 def _length(seconds: float | None, start: float) -> float | None:

@@ -2,8 +2,8 @@
 
 :class:`Store` is the write side, used by launches; :class:`Reader` is the read side, used by the
 analysis. A trial is registered, claimed by one launch, and committed completely or rejected.
-What a command does to a whole database is in modules of their own: ``merge``,
-``doctor`` and ``maintenance``.
+What a command does to a whole database is in the modules ``merge`` and
+``maintenance``.
 """
 
 from __future__ import annotations
@@ -35,15 +35,13 @@ from orchestrate.store.records import (
     Curves,
     LaunchRecord,
     LaunchRow,
-    Registrable,
     Registration,
     Table,
     Trajectory,
     TrialRow,
 )
-from orchestrate.store.results import Saved
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
-from orchestrate.store.store import LEASE_SECONDS, Store
+from orchestrate.store.store import LEASE_SECONDS, Saved, Store
 
 __all__ = [
     "CONFIG_COLUMNS",
@@ -70,7 +68,6 @@ __all__ = [
     "OpenTrial",
     "QueryError",
     "Reader",
-    "Registrable",
     "Registration",
     "RunRecord",
     "Saved",

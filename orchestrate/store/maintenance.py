@@ -40,7 +40,6 @@ from orchestrate.store.backends.base import (
     translated,
     translated_file,
 )
-from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import TrialKey
@@ -83,10 +82,7 @@ def _copy(parsed: URL, url: str, partial: Path) -> None:
         dump(parsed, schema, partial)
         return
     with translated(public_url(parsed), opening=True):
-        copy_checked(existing_path(parsed), partial)
-
-
-SUFFIX = ".db"
+        copy_checked(sqlite.existing_path(parsed), partial)
 
 
 def collect(url: str, folder: Path) -> None:
@@ -115,7 +111,7 @@ def collect(url: str, folder: Path) -> None:
 
 
 def merge_collected(
-    url: str, folder: Path, pattern: str = f"*{SUFFIX}", trial_key: TrialKey | None = None
+    url: str, folder: Path, pattern: str = "*.db", trial_key: TrialKey | None = None
 ) -> Iterator[Merged]:
     """Merge the copies in a folder into a database, one after the other.
 

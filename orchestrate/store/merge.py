@@ -10,9 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate, groupby
 from operator import itemgetter
 from typing import Any
@@ -26,7 +26,6 @@ from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend, parse_url, public_url, sqlite_path
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import DTYPE, Array, TrialKey, stored_json, unpack
-from orchestrate.store.results import insert_error, steps_ahead, unpacked
 from orchestrate.store.schema import (
     FINISHED,
     N_ROWS,
@@ -43,7 +42,7 @@ from orchestrate.store.schema import (
 )
 from orchestrate.store.schema import step as step_table
 from orchestrate.store.schema import trajectory as trajectory_table
-from orchestrate.store.store import Store
+from orchestrate.store.store import Store, insert_error, steps_ahead, unpacked
 
 PAGE = 50
 """Trials in one transaction, so that a concurrent launch waits for less than a second."""
@@ -106,25 +105,25 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Page:
-    """Trials of one transaction, and their rows in other tables, by trial_id.
+class Candidate:
+    """Trial of the source that has an outcome, and its rows in other tables.
 
     Attributes
     ----------
-    trials
-        Trials that have an outcome.
+    row
+        Its row, with the name of its configuration and the hash of its error.
     attempts
-        Finished attempts at a trial, the oldest first.
-    curves
-        Rows of the finished trials; none for a trial of which some are missing.
+        Finished attempts at it, the oldest first.
+    curve
+        Rows of a finished trial; None if some are missing.
     contradictory
-        Trials whose key does not match their configuration, or whose arrays have other shapes.
+        Whether its key does not match its configuration, or its arrays have other shapes.
     """
 
-    trials: list[dict[str, Any]]
-    attempts: Mapping[int, list[dict[str, Any]]]
-    curves: Mapping[int, Curve]
-    contradictory: Set[int]
+    row: dict[str, Any]
+    attempts: Sequence[dict[str, Any]]
+    curve: Curve | None
+    contradictory: bool
 
 
 class Source:
@@ -139,21 +138,52 @@ class Source:
         self._moment.launches()  # refuses texts that the readers of the target could not read
         return self._dicts("SELECT * FROM launch ORDER BY launch_id")
 
-    def pages(self) -> Iterator[Page]:
-        """Yield the trials that have an outcome, with their rows."""
+    def pages(self) -> Iterator[list[Candidate]]:
+        """Yield the trials that have an outcome, as many at once as one transaction takes."""
         last = 0
-        while trials := _first(self._dicts(_TRIALS, last=last, size=PAGE)):
-            first, last = trials[0]["trial_id"], trials[-1]["trial_id"]
-            attempts = defaultdict(list)
-            for row in self._dicts(_ATTEMPTS, first=first, last=last):
-                attempts[row["trial_id"]].append(row)
-            curves = self._curves(trials)
-            wrong = {
-                row["trial_id"]
-                for row in trials
-                if not (self._has_its_key(row) and _agree(row, curves.get(row["trial_id"])))
-            }
-            yield Page(trials, attempts, curves, wrong)
+        while rows := _first(self._dicts(_TRIALS, last=last, size=PAGE)):
+            last = rows[-1]["trial_id"]
+            yield self._candidates(rows, {"first": rows[0]["trial_id"], "last": last})
+
+    def _candidates(
+        self, rows: Sequence[dict[str, Any]], ends: Mapping[str, int]
+    ) -> list[Candidate]:
+        attempts = defaultdict(list)
+        for row in self._dicts(_ATTEMPTS, **ends):
+            attempts[row["trial_id"]].append(row)
+        steps = _by_trial(self._moment.rows(_STEPS, **ends))
+        assessments = _by_trial(self._moment.rows(_ASSESSMENTS, **ends))
+        trajectories = {row.pop("trial_id"): row for row in self._dicts(_TRAJECTORIES, **ends)}
+        found = []
+        for row in rows:
+            place = row["trial_id"]
+            rest = steps.get(place, []), trajectories.get(place), assessments.get(place, [])
+            curve = self._curve(row, *rest)
+            wrong = not (self._has_its_key(row) and _agree(row, curve))
+            found.append(Candidate(row, attempts[place], curve, wrong))
+        return found
+
+    def _curve(
+        self,
+        row: Mapping[str, Any],
+        steps: Sequence[tuple[Any, ...]],
+        trajectory: Mapping[str, Any] | None,
+        assessments: list[tuple[Any, ...]],
+    ) -> Curve | None:
+        values = np.array(steps, np.float64).reshape(-1, 1 + len(STEP_VALUES))
+        expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
+        if (
+            trajectory is None
+            or len(values) != row["n_rows"]
+            or not np.array_equal(values[:, 0], np.arange(len(values)))
+            or expected not in (None, len(_of_all(assessments)))
+        ):
+            return None
+        packed = {
+            name: bytes(one) if isinstance(one, memoryview) else one
+            for name, one in trajectory.items()
+        }
+        return Curve(values[:, 1:], packed, assessments)
 
     def _has_its_key(self, row: Mapping[str, Any]) -> bool:
         """Return whether keys are hashes of what is stored: no specification is built of it."""
@@ -174,27 +204,6 @@ class Source:
     def error(self, digest: str) -> dict[str, Any]:
         (row,) = self._dicts("SELECT * FROM error WHERE hash = :hash", hash=digest)
         return row
-
-    def _curves(self, trials: Sequence[dict[str, Any]]) -> dict[int, Curve]:
-        ends = {"first": trials[0]["trial_id"], "last": trials[-1]["trial_id"]}
-        steps = _by_trial(self._moment.rows(_STEPS, **ends))
-        assessments = _by_trial(self._moment.rows(_ASSESSMENTS, **ends))
-        trajectories = {row.pop("trial_id"): row for row in self._dicts(_TRAJECTORIES, **ends)}
-        curves = {}
-        for row in trials:
-            trial_id = row["trial_id"]
-            values = np.array(steps.get(trial_id, []), np.float64).reshape(-1, 1 + len(STEP_VALUES))
-            assessed = assessments.get(trial_id, [])
-            expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
-            if (
-                trial_id in trajectories
-                and len(values) == row["n_rows"]
-                and np.array_equal(values[:, 0], np.arange(len(values)))
-                and expected in (None, len(_of_all(assessed)))
-            ):
-                packed = {name: _bytes(one) for name, one in trajectories[trial_id].items()}
-                curves[trial_id] = Curve(values[:, 1:], packed, assessed)
-        return curves
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
         table = self._moment.rows(sql, **values)
@@ -236,10 +245,6 @@ def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
     return [tuple(one) for one in assessments if one[1] != SAMPLE_LOSS]
 
 
-def _bytes(value: Any) -> Any:
-    return bytes(value) if isinstance(value, memoryview) else value
-
-
 _COPIED = ("status", *OUTCOME_COLUMNS)
 _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
 _ASSESSMENTS_HERE = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
@@ -248,21 +253,6 @@ _ASSESSMENTS_HERE = select(assessment.c.t, assessment.c.measure, assessment.c.va
 _INSERT_TRIALS = insert(trial).returning(trial.c.trial_key, trial.c.trial_id)
 _UPDATE_TRIAL = update(trial).where(trial.c.trial_id == bindparam("here"))
 _STEPS_HERE = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
-
-
-@dataclass(frozen=True)
-class _Added:
-    """Trial of the source, its row in this database, and what is new here."""
-
-    row: Mapping[str, Any]
-    here: Row[Any] | None
-    attempts: Sequence[Mapping[str, Any]]
-    curve: Curve | None
-
-    @property
-    def attempt(self) -> int:
-        """Number of its last attempt in this database."""
-        return (0 if self.here is None else int(self.here.attempt)) + len(self.attempts)
 
 
 class Target:
@@ -280,7 +270,7 @@ class Target:
         self._source = source
         self._launches = launches
         self._configs: dict[str, int] = {}  # config_id here by key, filled on the way
-        self._added: list[_Added] = []
+        self._added: list[tuple[Candidate, Row[Any] | None]] = []
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
         """Return the trials with these keys, locked until the end of the transaction."""
@@ -290,42 +280,33 @@ class Target:
         rows = self._connection.execute(statement)
         return {row.trial_key: row for row in rows}
 
-    def new_attempts(
-        self, there: list[dict[str, Any]], here: Row[Any] | None
-    ) -> list[dict[str, Any]]:
-        """Return the attempts at a trial of the source that are new in this database."""
+    def with_new_attempts(self, one: Candidate, here: Row[Any] | None) -> Candidate:
+        """Return a trial of the source with the attempts alone that are new in this database."""
         if here is None:
-            return there
+            return one
         statement = select(attempt.c.launch_id, attempt.c.claimed)
-        known = {
-            tuple(one)
-            for one in self._connection.execute(
-                statement.where(attempt.c.trial_id == here.trial_id)
-            )
-        }
-        return [a for a in there if (self._launches[a["launch_id"]], a["claimed"]) not in known]
+        found = self._connection.execute(statement.where(attempt.c.trial_id == here.trial_id))
+        known = set(map(tuple, found))
+        new = [
+            a for a in one.attempts if (self._launches[a["launch_id"]], a["claimed"]) not in known
+        ]
+        return replace(one, attempts=new)
 
-    def add(
-        self,
-        row: Mapping[str, Any],
-        here: Row[Any] | None,
-        attempts: Sequence[Mapping[str, Any]],
-        curve: Curve | None,
-    ) -> None:
-        """Note a trial with its outcome, for :meth:`write`."""
-        self._added.append(_Added(row, here, attempts, curve))
+    def add(self, one: Candidate, here: Row[Any] | None) -> None:
+        """Note a trial with its outcome and new attempts, for :meth:`write`."""
+        self._added.append((one, here))
 
     def write(self) -> None:
         """Write the noted trials, with one statement for each table."""
         ids = self._write_trials()
         attempts: list[dict[str, Any]] = []
         curves, trajectories, assessments = [], [], []
-        for one in self._added:
+        for one, here in self._added:
             trial_id = ids[one.row["trial_key"]]
-            attempts += self._attempt_rows(trial_id, one)
+            attempts += self._attempt_rows(trial_id, one, here)
             if one.curve is not None:
                 self._backend.insert_steps(self._connection, trial_id, one.curve.steps)
-                curves.append((trial_id, one.attempt, one.curve.steps))
+                curves.append((trial_id, _last_attempt(one, here), one.curve.steps))
                 trajectories.append({"trial_id": trial_id, **one.curve.trajectory})
                 assessments += [
                     {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
@@ -375,26 +356,29 @@ class Target:
     def _write_trials(self) -> dict[str, int]:
         """Return the ids of the noted trials by their keys."""
         ids, new = {}, []
-        for one in self._added:
+        for one, here in self._added:
             row = one.row
-            values = {name: row[name] for name in _COPIED} | {"attempt": one.attempt}
+            values = {name: row[name] for name in _COPIED} | {"attempt": _last_attempt(one, here)}
             for name in ("launch_id", "registered_by"):
                 values[name] = self._launches.get(row[name])
             values["error_id"] = self._error(row["error_hash"])
-            if one.here is None:
+            if here is None:
                 values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
                 new.append(
                     values | {"config_id": self._config(row["config_key"], row["config_id"])}
                 )
             else:
-                ids[row["trial_key"]] = one.here.trial_id
-                self._connection.execute(_UPDATE_TRIAL, {"here": one.here.trial_id, **values})
+                ids[row["trial_key"]] = here.trial_id
+                self._connection.execute(_UPDATE_TRIAL, {"here": here.trial_id, **values})
         if new:
             ids |= dict(map(tuple, self._connection.execute(_INSERT_TRIALS, new)))
         return ids
 
-    def _attempt_rows(self, trial_id: int, one: _Added) -> Iterator[dict[str, Any]]:
-        for number, row in enumerate(one.attempts, start=one.attempt - len(one.attempts) + 1):
+    def _attempt_rows(
+        self, trial_id: int, one: Candidate, here: Row[Any] | None
+    ) -> Iterator[dict[str, Any]]:
+        before = _last_attempt(one, here) - len(one.attempts)
+        for number, row in enumerate(one.attempts, start=before + 1):
             values = {name: row[name] for name in attempt.c.keys()}  # noqa: SIM118  not a dict
             yield values | {
                 "trial_id": trial_id,
@@ -405,18 +389,15 @@ class Target:
 
     def _config(self, config_key: str, there: int) -> int:
         if config_key not in self._configs:
-            self._configs[config_key] = self._find_config(config_key, there)
+            statement = select(config.c.config_id).where(config.c.config_key == config_key)
+            here = self._connection.execute(statement).scalar()
+            if here is None:
+                values = self._source.config(there)
+                del values["config_id"]
+                adding = insert(config).values(values).returning(config.c.config_id)
+                here = self._connection.execute(adding).scalar_one()
+            self._configs[config_key] = int(here)
         return self._configs[config_key]
-
-    def _find_config(self, config_key: str, there: int) -> int:
-        statement = select(config.c.config_id).where(config.c.config_key == config_key)
-        here = self._connection.execute(statement).scalar()
-        if here is None:
-            values = self._source.config(there)
-            del values["config_id"]
-            adding = insert(config).values(values).returning(config.c.config_id)
-            here = self._connection.execute(adding).scalar_one()
-        return int(here)
 
     def _error(self, digest: str | None) -> int | None:
         if digest is None:
@@ -428,6 +409,11 @@ class Target:
             del values["error_id"]
             return insert_error(self._connection, values)
         return int(here)
+
+
+def _last_attempt(one: Candidate, here: Row[Any] | None) -> int:
+    """Return the number of the last attempt in this database at a trial with new attempts."""
+    return (0 if here is None else int(here.attempt)) + len(one.attempts)
 
 
 def add_launches(
@@ -532,33 +518,26 @@ def merge(url: str, other_url: str, trial_key: TrialKey | None = None) -> Merged
             with store._backend.transaction() as connection:
                 store._backend.exclusive(connection)
                 target = Target(connection, store._backend, source, launches)
-                found = _merge_page(target, page)
+                known = target.known([one.row["trial_key"] for one in page])
+                found = [
+                    (_merge_trial(target, one, known.get(one.row["trial_key"])), one.row)
+                    for one in page
+                ]
+                target.write()
             _count(merged, found)
     return merged
 
 
-Found = list[tuple[str, dict[str, Any]]]
-
-
-def _merge_page(target: Target, page: Page) -> Found:
-    known = target.known([row["trial_key"] for row in page.trials])
-    found = [
-        (_merge_trial(target, page, row, known.get(row["trial_key"])), row) for row in page.trials
-    ]
-    target.write()
-    return found
-
-
-def _merge_trial(target: Target, page: Page, row: dict[str, Any], here: Row[Any] | None) -> str:
+def _merge_trial(target: Target, one: Candidate, here: Row[Any] | None) -> str:
     """Copy one trial if it is new here; return the outcome as a field of :class:`Merged`."""
-    if row["trial_id"] in page.contradictory:
+    row, curve = one.row, one.curve
+    if one.contradictory:
         return "contradictory"
     finished = row["status"] in FINISHED
     if here is not None and here.status == "running":
         return "running"
     if here is not None and not finished and here.status != "pending":
         return "kept"
-    curve = page.curves.get(row["trial_id"])
     if finished and curve is None:
         return "incomplete"
     if curve is not None and here is not None and here.status in FINISHED:
@@ -570,14 +549,14 @@ def _merge_trial(target: Target, page: Page, row: dict[str, Any], here: Row[Any]
         if ahead > 0:
             return "kept"
         target.clear(here)
-    attempts = target.new_attempts(page.attempts[row["trial_id"]], here)
-    if here is not None and row["status"] != "done" and not attempts:
+    new = target.with_new_attempts(one, here)
+    if here is not None and row["status"] != "done" and not new.attempts:
         return "kept"  # it was merged before, and a new run was requested here since
-    target.add(row, here, attempts, curve)
+    target.add(new, here)
     return "added"
 
 
-def _count(merged: Merged, found: Found) -> None:
+def _count(merged: Merged, found: Sequence[tuple[str, dict[str, Any]]]) -> None:
     for fate, row in found:
         if fate == "added":
             merged.added[row["status"]] = merged.added.get(row["status"], 0) + 1

@@ -16,15 +16,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
-from functools import partial
-from itertools import chain
 from select import POLLIN
 from select import poll as new_poll
 from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import URL, Connection, Engine, bindparam, select, text
+from sqlalchemy import URL, Connection, Engine, select, text
 from sqlalchemy.exc import DBAPIError
 
 from dopt.errors import suggestion
@@ -51,7 +49,7 @@ from orchestrate.store.records import (
     TrialRow,
     read_curves,
     stored_json,
-    unpack,
+    unpacked_trajectory,
 )
 from orchestrate.store.schema import (
     FINISHED,
@@ -60,7 +58,6 @@ from orchestrate.store.schema import (
     assessment,
     config,
     launch,
-    trajectory,
     trial,
 )
 
@@ -171,42 +168,17 @@ def _failure(error: Exception, sql: str, safe_url: str) -> Exception:
     return QueryError(f"The query failed on {safe_url}: {error}.")
 
 
-Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
-
 _LAUNCHES = select(launch).order_by(launch.c.launch_id)
-
-
-def launch_rows(connection: Connection, dead: Dead) -> list[LaunchRow]:
-    """Return all launches, the oldest first; ``dead`` selects the dead ones among the running."""
-    rows = [row._asdict() for row in connection.execute(_LAUNCHES)]
-    running = [
-        LaunchLife(row["launch_id"], row["token"], row["lease_until"])
-        for row in rows
-        if row["state"] == "running"
-    ]
-    gone = {one.launch_id for one in dead(connection, running)}
-    alive = {one.launch_id for one in running} - gone
-    return [_launch(row, row["launch_id"] in alive) for row in rows]
+_JSON = {"argv": list, "overrides": list, "versions": dict, "fingerprint": dict}
 
 
 def _launch(row: Mapping[str, Any], alive: bool) -> LaunchRow:
-    dirty = row["git_dirty"]
-    return LaunchRow(
-        launch_id=row["launch_id"],
-        state=row["state"],
-        alive=alive,
-        started=row["started"],
-        ended=row["ended"],
-        host=row["host"],
-        pid=row["pid"],
-        argv=stored_json(row["argv"], list),
-        overrides=stored_json(row["overrides"], list),
-        git_commit=row["git_commit"],
-        git_dirty=None if dirty is None else bool(dirty),
-        git_diff_hash=row["git_diff_hash"],
-        versions=stored_json(row["versions"], dict),
-        fingerprint=row["fingerprint"] and stored_json(row["fingerprint"], dict),
-    )
+    values = {one.name: row[one.name] for one in fields(LaunchRow) if one.name != "alive"}
+    texts = {name: values[name] for name in _JSON if values[name] is not None}
+    values |= {name: stored_json(text, _JSON[name]) for name, text in texts.items()}
+    if values["git_dirty"] is not None:
+        values["git_dirty"] = bool(values["git_dirty"])
+    return LaunchRow(**values, alive=alive)
 
 
 _CONFIGS = text(
@@ -228,17 +200,10 @@ _MIXED = (
     "JOIN config c ON c.config_id = r.config_id WHERE r.status IN ('done', 'diverged') "
     "GROUP BY c.config_key HAVING count(DISTINCT l.fingerprint) > 1 ORDER BY c.config_key"
 )
-_ARRAYS = ("states", "inputs", "parameters")
-_TRAJECTORY = (
-    select(
-        trajectory.c.dtype,
-        *chain.from_iterable(
-            (trajectory.c[f"{name}_shape"], trajectory.c[name]) for name in _ARRAYS
-        ),
-    )
-    .join(trial, trial.c.trial_id == trajectory.c.trial_id)
-    .join(config, config.c.config_id == trial.c.config_id)
-    .where(config.c.config_key == bindparam("config_key"), trial.c.seed == bindparam("seed"))
+_TRAJECTORY = text(
+    "SELECT j.dtype, j.states_shape, j.states, j.inputs_shape, j.inputs, j.parameters_shape, "
+    "j.parameters FROM v_trial v JOIN trajectory j ON j.trial_id = v.trial_id "
+    "WHERE v.config_key = :config_key AND v.seed = :seed"
 )
 
 
@@ -314,7 +279,15 @@ class Reader:
     def launches(self) -> list[LaunchRow]:
         """Return all launches that wrote to the database, the oldest first."""
         with self._snapshot() as connection:
-            return launch_rows(connection, partial(self._kind.dead, self._url))
+            rows = [row._asdict() for row in connection.execute(_LAUNCHES)]
+            running = [
+                LaunchLife(row["launch_id"], row["token"], row["lease_until"])
+                for row in rows
+                if row["state"] == "running"
+            ]
+            gone = {one.launch_id for one in self._kind.dead(self._url, connection, running)}
+        alive = {one.launch_id for one in running} - gone
+        return [_launch(row, row["launch_id"] in alive) for row in rows]
 
     def mixed_code(self) -> list[str]:
         """Return the keys of configurations whose finished trials were run by different code."""
@@ -332,7 +305,8 @@ class Reader:
         Raises ``QueryError`` if the column or the configuration is unknown, and
         ``StoreUnavailableError`` if a step is missing.
         """
-        _check_column(column)
+        if column not in STEP_VALUES:
+            raise QueryError(f"A step has no column '{column}': {suggestion(column, STEP_VALUES)}")
         place = f"configuration {config_key[:12]} in {self.safe_url}"
         with self._snapshot() as connection:
             return read_curves(connection, *_config(connection, config_key), column, place)
@@ -368,8 +342,7 @@ class Reader:
                 f"There is no trajectory of seed {seed} of configuration {config_key[:12]} in "
                 f"{self.safe_url}: run that trial first."
             )
-        dtype, *packed = row
-        return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
+        return unpacked_trajectory(*row)
 
     def query(
         self,
@@ -444,11 +417,6 @@ def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:
         values=values,
         diverged=np.array([one == "diverged" for one in status.values()], dtype=np.bool_),
     )
-
-
-def _check_column(column: str) -> None:
-    if column not in STEP_VALUES:
-        raise QueryError(f"A step has no column '{column}': {suggestion(column, STEP_VALUES)}")
 
 
 def _config(connection: Connection, config_key: str) -> tuple[int, int]:
@@ -583,10 +551,10 @@ def explorations(reader: Reader) -> list[ExplorationRow]:
     if not rows:
         return []
     alive = {one.launch_id for one in reader.launches() if one.state == "running" and one.alive}
-    return [_exploration(row._asdict(), alive) for row in rows]
-
-
-def _exploration(values: dict[str, Any], alive: set[int]) -> ExplorationRow:
-    is_saved = values.pop("launch_id") in alive
-    can_grow = values["status"] == "done" and values["n_steps"] < values["horizon"]
-    return ExplorationRow(**values, is_running=is_saved and can_grow)
+    found = []
+    for row in rows:
+        values = row._asdict()
+        is_saved = values.pop("launch_id") in alive
+        grows = is_saved and row.status == "done" and row.n_steps < row.horizon
+        found.append(ExplorationRow(**values, is_running=grows))
+    return found

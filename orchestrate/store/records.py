@@ -20,8 +20,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
-from itertools import chain
-from typing import Any, Protocol, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,14 +28,11 @@ from sqlalchemy import (
     Case,
     ColumnElement,
     Connection,
-    CursorResult,
-    Row,
     Select,
     and_,
     bindparam,
     case,
     delete,
-    exists,
     insert,
     select,
     text,
@@ -50,21 +46,6 @@ Array = npt.NDArray[np.float64]
 
 TrialKey = Callable[[str, int], str]
 """Function from the JSON of a configuration and a seed to the key of the trial."""
-
-
-class Registrable(Protocol):
-    """Trial before it runs, such as :class:`dopt.spec.trial.TrialSpec`."""
-
-    @property
-    def trial_key(self) -> str: ...
-    @property
-    def config_key(self) -> str: ...
-    @property
-    def config_json(self) -> str: ...
-    @property
-    def seed(self) -> int: ...
-    def columns(self) -> Mapping[str, Any]:
-        """Values of env, policy, model, learner, width, depth, horizon, dt, gamma and label."""
 
 
 @dataclass(frozen=True)
@@ -272,8 +253,7 @@ class Curves:
     diverged: npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Assessments:
+class Assessments(Curves):
     """Measure of all n finished trials of a configuration, after k numbers of steps.
 
     Attributes
@@ -283,11 +263,6 @@ class Assessments:
     values : (n, k) float64, NaN where it is not finite or a trial diverged before that step
     diverged : (n,) bool
     """
-
-    seeds: npt.NDArray[np.int64]
-    t: npt.NDArray[np.int64]
-    values: Array
-    diverged: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -303,8 +278,8 @@ class TrialRow(Outcome):
     error_message: str | None
 
 
-@dataclass(frozen=True)
-class LaunchRow:
+@dataclass(frozen=True, kw_only=True)
+class LaunchRow(LaunchRecord):
     """Launch that wrote to the database, and whether its process is alive.
 
     Attributes
@@ -320,15 +295,6 @@ class LaunchRow:
     alive: bool
     started: str
     ended: str | None
-    host: str
-    pid: int
-    argv: Sequence[str]
-    overrides: Sequence[str]
-    git_commit: str | None
-    git_dirty: bool | None
-    git_diff_hash: str | None
-    versions: Mapping[str, str]
-    fingerprint: Mapping[str, str] | None = None
 
     @property
     def kind(self) -> str:
@@ -367,6 +333,11 @@ class Trajectory:
     states: Array
     inputs: Array
     parameters: Array
+
+
+def unpacked_trajectory(dtype: str, *packed: Any) -> Trajectory:
+    """Return the arrays of a row: the type, and the shape and the bytes of each array."""
+    return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
 
 
 PAGE = 200
@@ -437,7 +408,7 @@ def _checksum(data: bytes) -> bytes:
 
 
 _TRIALS = (
-    f"SELECT r.seed, r.status, {N_ROWS} AS n, p.{{column}} AS packed FROM trial r "
+    f"SELECT r.trial_id, r.seed, r.status, {N_ROWS} AS n, p.{{column}} AS packed FROM trial r "
     "JOIN config c ON c.config_id = r.config_id "
     "LEFT JOIN curve p ON p.trial_id = r.trial_id AND p.attempt = r.attempt "
     "WHERE c.config_id = :config_id AND r.status IN ('done', 'diverged') ORDER BY r.seed"
@@ -453,19 +424,22 @@ def read_curves(
     """
     statement = text(_TRIALS.format(column=column))
     trials = connection.execute(statement, {"config_id": config_id}).all()
-    rest = [row.n for row in trials if row.packed is None]
-    stepwise = _stepwise(connection, config_id, horizon, column) if rest else _NONE
-    parts = _parts(trials, stepwise, rest)
+    parts = [
+        _of_steps(connection, row.trial_id, row.n, column)
+        if row.packed is None
+        else unpacked_curve(row.packed)
+        for row in trials
+    ]
     lengths = np.array([row.n for row in trials], dtype=np.int64)
-    found = sum(map(len, parts))
-    if stepwise.size != sum(rest) or found != lengths.sum():
+    found = [len(part) for part in parts]
+    if found != lengths.tolist():
         raise StoreUnavailableError(
-            f"The curves of {place} are incomplete ({found:,} steps instead of "
+            f"The curves of {place} are incomplete ({sum(found):,} steps instead of "
             f"{lengths.sum():,}): the database is damaged; run python -m orchestrate doctor."
         )
     t = np.arange(lengths.max(initial=0) if trials else horizon, dtype=np.int64)
     values = np.full((len(trials), len(t)), np.nan)
-    values[t < lengths[:, None]] = np.concatenate([_NONE, *parts])
+    values[t < lengths[:, None]] = np.concatenate([np.empty(0), *parts])
     return Curves(
         seeds=np.array([row.seed for row in trials], dtype=np.int64),
         t=t,
@@ -474,35 +448,8 @@ def read_curves(
     )
 
 
-_NONE: Array = np.empty(0)
-
-
-def _parts(trials: Sequence[Row[Any]], stepwise: Array, rest: Sequence[int]) -> list[Array]:
-    """Return the numbers of each trial: those that are not packed are taken from ``stepwise``.
-
-    A damaged array gives an empty one.
-    """
-    pieces = iter(np.split(stepwise, np.cumsum(rest)[:-1]))
-    return [next(pieces) if row.packed is None else unpacked_curve(row.packed) for row in trials]
-
-
-def _stepwise(connection: Connection, config_id: int, horizon: int, column: str) -> Array:
-    """Return a column of the steps of the trials without a packed curve, NULL as NaN."""
-    packed = exists().where(CURRENT).correlate(trial).select_from(curve)
-    finished = (trial.c.config_id == config_id) & trial.c.status.in_(FINISHED)
-    statement = (
-        select(step.c[column])
-        .join(trial, trial.c.trial_id == step.c.trial_id)
-        .where(finished, ~packed, step.c.t.between(0, horizon - 1))
-        .order_by(trial.c.seed, step.c.t)
-    )
-    return _numbers(connection.execute(statement))
-
-
-def _numbers(result: CursorResult[Any]) -> Array:
-    """Return the only column of a result, NULL as NaN.
-
-    The driver's cursor is read directly, because a SQLAlchemy row for each number doubles the time.
-    """
-    rows = cast("Iterable[tuple[float | None]]", result.cursor)
-    return np.fromiter(chain.from_iterable(rows), np.float64)
+def _of_steps(connection: Connection, trial_id: int, n: int, column: str) -> Array:
+    """Return a column of the first n steps of a trial without a packed curve, NULL as NaN."""
+    first = (step.c.trial_id == trial_id) & step.c.t.between(0, n - 1)
+    numbers = connection.execute(select(step.c[column]).where(first).order_by(step.c.t))
+    return np.array(numbers.scalars().all(), np.float64)

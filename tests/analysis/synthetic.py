@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from dopt.systems.properties import eigenmode
 from orchestrate.store import LaunchRecord, Reader, RunRecord, Store
 
 Array = npt.NDArray[np.float64]
+Edit = Callable[[TrialSpec, TrialResult], TrialResult]
+"""Change of a made-up result before it is stored."""
 
 ENVIRONMENTS = ("pendulum", "cartpole", "arm", "quadrotor")
 POLICIES = ("d_optimal", "oracle", "uniform", "periodic", "random")
@@ -197,7 +200,7 @@ def fill(
     specs: list[TrialSpec],
     skipped: Iterable[TrialSpec] = (),
     diverged: Mapping[str, int] | None = None,
-    edit: Callable[[TrialSpec, TrialResult], TrialResult] = lambda _, result: result,
+    edit: Edit = lambda _, result: result,
 ) -> None:
     """Register all trials and run all but the skipped; ``diverged`` maps trial keys to steps.
 
@@ -226,3 +229,14 @@ def fill(
 def simulated(spec: TrialSpec, _: TrialResult) -> TrialResult:
     """Return the result of the trial itself in place of a made-up one."""
     return run_trial(spec)
+
+
+def valued(value: Callable[[TrialSpec, Assessment], float | None]) -> Edit:
+    """Return an edit that gives assessments the value of a function; None keeps their own."""
+
+    def edit(spec: TrialSpec, result: TrialResult) -> TrialResult:
+        found = [(row, value(spec, row)) for row in result.assessments]
+        rows = (row if new is None else row._replace(value=new) for row, new in found)
+        return replace(result, assessments=tuple(rows))
+
+    return edit

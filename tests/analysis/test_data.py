@@ -21,7 +21,6 @@ from analysis.figures.phase_portraits import (
     measure_portraits,
     measure_spectra,
     tabulate_portraits,
-    tabulate_spectra,
 )
 from analysis.stats.curves import PlotOptions, Statistic, measure_curves, tabulate_curves
 from analysis.tables.comparisons import compare_policies
@@ -233,7 +232,7 @@ def _numbers(reader: Reader) -> list[pd.DataFrame]:
         for statistic in Statistic
     ]
     cartpole = selection.only(["cartpole"])
-    spectra = tabulate_spectra(measure_spectra(reader, cartpole, "cartpole"))
+    spectra = measure_spectra(reader, cartpole, "cartpole").table
     portraits = tabulate_portraits(measure_portraits(reader, cartpole, "cartpole"))
     return [*tables, *curves, spectra, portraits]
 

@@ -8,15 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from analysis.cli import main
 from analysis.data.matching import Filter
 from analysis.data.samples import DivergenceRule
-from analysis.data.selection import Selection, select
+from analysis.data.selection import select
 from analysis.figures.pareto import (
     PARETO,
-    Point,
     draw,
     measure_points,
     pareto_part,
@@ -30,7 +30,7 @@ from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, wide
-from tests.analysis.synthetic import fill, make_grid
+from tests.analysis.synthetic import fill, filled, make_grid
 
 
 def test_the_ratio_over_systems_is_the_geometric_mean_of_theirs(
@@ -58,17 +58,6 @@ def test_the_table_says_which_systems_a_row_is_of(
     assert "needs trials of the reference d_optimal" in capsys.readouterr().err
 
 
-def reader_of(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Reader:
-    address = f"sqlite:///{folder}/results.db"
-    for specs, skipped in fillings:
-        fill(address, specs, skipped=skipped)
-    return Reader.open(address)
-
-
-def widths_of(selection: Selection) -> list[int | None]:
-    return [entry.config.width for entry in selection.entries]
-
-
 def test_other_widths_leave_the_selection_of_the_other_figures_alone(reader: Reader) -> None:
     selection = select(reader, Filter())
     assert selection.gaps == ()
@@ -81,7 +70,7 @@ def test_however_many_trials_another_width_has(tmp_path: Path, seeds: int) -> No
     grid = make_grid(("cartpole",), ("d_optimal", "random", "oracle"), range(5), **SHORT)
     extra = wide(64, range(seeds)) + wide(16, range(seeds), learner={"name": "adam"})
     extra += wide(16, range(seeds), policy={"regularization": 0.5})[: min(seeds, 5)]
-    with reader_of(tmp_path, (grid + extra, [])) as reader:
+    with filled(tmp_path, grid + extra) as reader:
         selection = select(reader, Filter())
     assert selection.gaps == ()
     assert {entry.config.config_key for entry in selection.entries} == {s.config_key for s in grid}
@@ -89,8 +78,8 @@ def test_however_many_trials_another_width_has(tmp_path: Path, seeds: int) -> No
 
 def test_a_database_of_widths_alone_takes_the_width_of_the_paper(tmp_path: Path) -> None:
     specs = [spec for width in (8, 16, 32) for spec in wide(width, range(3))]
-    with reader_of(tmp_path, (specs, [])) as reader:
-        assert widths_of(select(reader, Filter())) == [16]
+    with filled(tmp_path, specs) as reader:
+        assert [one.config.width for one in select(reader, Filter()).entries] == [16]
 
 
 LEARNERS: tuple[dict[str, object], ...] = (
@@ -132,27 +121,29 @@ def learners(tmp_path_factory: pytest.TempPathFactory) -> str:
     return address
 
 
-def points_of(url: str, rule: DivergenceRule = DivergenceRule.EXCLUDE) -> tuple[Point, ...]:
+def points_of(url: str, rule: DivergenceRule = DivergenceRule.EXCLUDE) -> pd.DataFrame:
     with Reader.open(url) as reader:
-        return measure_points(reader, pareto_part(select(reader, Filter())), rule)
+        points = measure_points(reader, pareto_part(select(reader, Filter())), rule)
+    return points.set_index(["env", "label"], drop=False)
 
 
 def test_a_point_is_a_configuration_of_an_environment_that_has_several(learners: str) -> None:
     points = points_of(learners)
-    labels = [point.label for point in points if point.env == "pendulum"]
-    assert len(labels) == len(set(labels)) == 10  # neither the task nor the other bound
-    assert {point.env for point in points} == set(ENVS)
-    assert "random, gauss_newton, refit_every=10" in labels
-    words = {(one.policy_label, one.learner_label) for one in points if one.env == "pendulum"}
+    assert set(points.env) == set(ENVS)
+    own = points.loc["pendulum"]
+    assert own.label.is_unique
+    assert len(own) == 10  # neither the task nor the other bound
+    assert "random, gauss_newton, refit_every=10" in own.index
+    words = set(zip(own.policy_label, own.learner_label, strict=True))
     assert len(words) == 10
     assert {("random", "gauss_newton"), ("random", "gauss_newton, ensemble")} <= words
     assert list(policies_of(points)) == ["D-optimal", "D-optimal, information=fresh", "random"]
 
 
 def test_time_counts_the_fits_of_some_steps_and_loss_is_a_geometric_mean(learners: str) -> None:
-    found = {(one.env, one.label): one for one in points_of(learners)}
-    assert found["pendulum", "random, gauss_newton"].us_per_step == pytest.approx(105.0)
-    every_tenth = found["pendulum", "random, gauss_newton, refit_every=10"]
+    found = points_of(learners).loc["pendulum"]
+    assert found.us_per_step["random, gauss_newton"] == pytest.approx(105.0)
+    every_tenth = found.loc["random, gauss_newton, refit_every=10"]
     assert every_tenth.us_per_step == pytest.approx(5.0 + (100.0 + 9 * 1.0) / 10)
     with Reader.open(learners) as reader:
         [config] = [
@@ -167,24 +158,23 @@ def test_time_counts_the_fits_of_some_steps_and_loss_is_a_geometric_mean(learner
 
 
 def test_each_environment_has_its_front(learners: str) -> None:
-    points = [one for one in points_of(learners) if one.env == "pendulum"]
-    front = on_front(np.array([(one.us_per_step, one.loss) for one in points]))
-    assert [one.on_front for one in points] == front.tolist()
+    points = points_of(learners).loc["pendulum"]
+    assert points.us_per_step.is_monotonic_increasing
+    front = on_front(points[["us_per_step", "loss"]].to_numpy())
+    assert points.on_front.tolist() == front.tolist()
     assert 0 < front.sum() < len(points)
 
 
 def test_diverged_trials_are_counted_and_said(learners: str) -> None:
     points = points_of(learners)
-    [some] = [one for one in points if (one.env, one.label) == ("pendulum", "random, adam")]
+    some, none = (points.loc[(env, "random, adam")] for env in ENVS)
     assert (some.n, some.n_diverged, some.counts) == (2, 1, "2/3, 1 diverged")
-    [none] = [one for one in points if (one.env, one.label) == ("quadrotor", "random, adam")]
     assert not none.known
     assert not none.on_front
-    words = PARETO.caption((DivergenceRule.EXCLUDE, points))
+    words = PARETO.caption((DivergenceRule.EXCLUDE, points.reset_index(drop=True)))
     assert "No point, as no trial has a positive final loss: quadrotor, random, adam (0/3" in words
     assert "random, adam: 2/3, 1 diverged" in words
-    lent = points_of(learners, DivergenceRule.WORST)
-    assert [one.n for one in lent if (one.env, one.label) == ("pendulum", "random, adam")] == [3]
+    assert points_of(learners, DivergenceRule.WORST).n["pendulum", "random, adam"] == 3
 
 
 def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> None:
@@ -198,8 +188,7 @@ def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> Non
 
 
 def test_the_time_between_two_steps_is_marked(learners: str) -> None:
-    points = tuple(replace(one, limit_us=10.0) for one in points_of(learners))
-    first, *_ = draw(points).axes
+    first, *_ = draw(points_of(learners).reset_index(drop=True).assign(limit_us=10.0)).axes
     assert [text.get_text() for text in first.texts] == ["dt = 0.01 ms"]
 
 

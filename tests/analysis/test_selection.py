@@ -24,11 +24,10 @@ from analysis.data.matching import (
     _argument,
     choose,
     difference,
-    flatten,
     newest,
 )
 from analysis.data.samples import DivergenceRule, apply_rule
-from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, ranges, select
+from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, select
 from analysis.tables.comparisons import compare_policies, references
 from dopt import registry
 from dopt.policies import POLICIES
@@ -151,6 +150,7 @@ def test_the_advice_on_a_tie_names_what_all_of_them_have() -> None:
         choice(*((one, 5) for one in filters))
     path, values = difference([filters[0].config, config("pendulum", "d_optimal").config])
     assert (path, values) == ("learner.name", ["ekf", "adam_window"])
+    assert difference([filters[0].config] * 2)[0] == "config_key"
 
 
 def test_more_trials_of_the_baselines_settle_a_tie_of_the_reference() -> None:
@@ -179,15 +179,6 @@ def test_a_condition_that_nothing_meets_is_a_sentence() -> None:
         Filter(where={"model.with": 16}).check_where(configs)
     with pytest.raises(AnalysisError, match=r"model\.width=9 fits no .* stored are 16"):
         Filter(where={"model.width": 9}).check_where(configs)
-
-
-def test_flatten() -> None:
-    assert flatten({"a": {"b": 1, "c": {"d": 2}}, "e": 3}) == {"a.b": 1, "a.c.d": 2, "e": 3}
-
-
-def test_difference_of_equal_configurations_is_their_key() -> None:
-    same = config("pendulum", "random").config
-    assert difference([same, same])[0] == "config_key"
 
 
 OLD, NEW = "a" * 16, "b" * 16
@@ -369,11 +360,6 @@ def test_requests_without_an_answer_are_sentences(
 def test_every_registered_name_has_a_place_in_the_order() -> None:
     assert len({policy_rank(name)[0] for name in POLICIES}) == len(POLICIES)
     assert len({environment_rank(name)[0] for name in SYSTEMS}) == len(SYSTEMS)
-
-
-def test_ranges() -> None:
-    assert ranges([4, 0, 1, 2, 7, 8]) == "0-2, 4, 7-8"
-    assert ranges([]) == ""
 
 
 @pytest.fixture(scope="module")

@@ -90,14 +90,6 @@ def test_centres_by_hand() -> None:
 
 
 @pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
-def test_an_outlier_moves_the_robust_centres_little(statistic: Statistic) -> None:
-    values = np.random.default_rng(0).normal(size=(41, 1))
-    moved = np.where(values == values.max(), 1e6, values)
-    assert centre(moved, statistic)[0] == pytest.approx(centre(values, statistic)[0], abs=1e-9)
-    assert centre(moved, Statistic.MEAN)[0] > 1e4
-
-
-@pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
 def test_the_bootstrap_draws_whole_trials_and_the_same_ones_each_time(
     statistic: Statistic,
 ) -> None:
@@ -217,6 +209,9 @@ def test_race_by_hand() -> None:
     assert found.improvement == (2 + 2 / 2) / 5  # earlier twice, tied twice
     assert found.p_value == pytest.approx(1.0)  # two wins and one loss of three
     assert (found.median, found.median_reference) == (7, 8)
+    none = compare_hitting_times(np.empty(0), np.empty(0))
+    assert none.n_pairs == 0
+    assert np.isnan([none.improvement, none.p_value]).all()
 
 
 def test_swapping_the_sides_swaps_the_race() -> None:
@@ -238,13 +233,6 @@ def test_a_median_past_the_horizon_is_censored() -> None:
     assert censored_median(np.array([1.0, 2.0, INF])) == 2
     assert censored_median(np.array([1.0, 2.0, INF, INF])) == INF  # just half of them reached it
     assert math.isnan(censored_median(np.empty(0)))
-
-
-def test_race_of_no_pair_is_nan() -> None:
-    found = compare_hitting_times(np.empty(0), np.empty(0))
-    assert found.n_pairs == 0
-    assert math.isnan(found.improvement)
-    assert math.isnan(found.p_value)
 
 
 def test_scores_follow_from_the_stored_curves(reader: Reader) -> None:
@@ -416,11 +404,6 @@ def test_a_loss_of_zero_is_counted_but_has_no_ratio() -> None:
     assert np.isnan([found.ratio, found.low, found.high, found.p_value]).all()
 
 
-def test_signed_rank_of_a_textbook_case() -> None:
-    # ranks 1..6 with the smallest negative: W = 1, of 64 sign patterns 2 have W <= 1
-    assert signed_rank(np.array([-1.0, 2, 3, 4, 5, 6])) == pytest.approx(2 * 2 / 64)
-
-
 @pytest.mark.parametrize("family", ["normal", "exponential"])
 def test_the_interval_of_many_values_is_near_the_bootstrap(family: str) -> None:
     draw = getattr(np.random.default_rng(3), family)
@@ -433,17 +416,11 @@ def test_the_interval_of_many_values_is_near_the_bootstrap(family: str) -> None:
     assert found != pytest.approx(bootstrap, abs=1e-9)
 
 
-def test_benjamini_hochberg_by_hand() -> None:
-    # sorted p times m / rank, then the running minimum from the right
-    assert benjamini_hochberg([0.01, 0.04, 0.03, 0.5]) == pytest.approx(
-        [0.04, 0.16 / 3, 0.16 / 3, 0.5]
-    )
-
-
 def test_benjamini_hochberg_leaves_out_what_was_not_tested() -> None:
-    adjusted = benjamini_hochberg([0.02, math.nan, 0.5])
-    assert adjusted[0] == pytest.approx(0.04)
-    assert math.isnan(adjusted[1])
+    # sorted p times m / rank, then the running minimum from the right
+    found = benjamini_hochberg([0.01, 0.04, math.nan, 0.03, 0.5])
+    expected = [0.04, 0.16 / 3, math.nan, 0.16 / 3, 0.5]
+    assert found == pytest.approx(expected, nan_ok=True)
     assert benjamini_hochberg([]) == []
 
 

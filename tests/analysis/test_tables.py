@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from analysis.cli import main
 from analysis.data.matching import AnalysisError, Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
-from analysis.figures.phase_portraits import measure_spectra, spectrum_caption, tabulate_spectra
+from analysis.figures.phase_portraits import measure_spectra, spectrum_caption
 from analysis.outputs import build
 from analysis.report import CAPTION, EXPLAINED
 from analysis.stats.curves import (
@@ -40,18 +39,26 @@ from analysis.stats.scores import (
     task_of,
     true_model,
 )
-from analysis.style import count_text, number, p_text, plus_minus, unit_of
+from analysis.style import number, p_text, plus_minus
 from analysis.tables.comparisons import compare_control, compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table
 from analysis.tables.variants import TRUTH, VariantGroup, tabulate_control_of
 from dopt.assessment import TURN, turns, wrap
 from dopt.offline_fit import held_out_fit
-from dopt.result import Assessment, TrialResult
+from dopt.result import Assessment
 from dopt.run import run_trial
-from dopt.spec.trial import TrialSpec
 from orchestrate.store import Assessments, Reader
 from tests.analysis.conftest import SHORT
-from tests.analysis.synthetic import fake_result, fill, filled, make_grid, make_spec, simulated
+from tests.analysis.synthetic import (
+    Edit,
+    fake_result,
+    fill,
+    filled,
+    make_grid,
+    make_spec,
+    simulated,
+    valued,
+)
 from tests.dopt.trials import trial
 
 SEEDS = range(5)
@@ -109,14 +116,6 @@ def test_a_row_does_not_depend_on_the_others(reader: Reader) -> None:
     assert same[columns].to_numpy().tolist() == part[columns].to_numpy().tolist()
 
 
-def test_the_other_column(reader: Reader) -> None:
-    selection = select(reader, Filter(("pendulum",)))
-    loss, reachable = (
-        compare_policies(reader, selection, column) for column in ("loss", "reachable_loss")
-    )
-    assert reachable.ratio.to_numpy() == pytest.approx(loss.ratio.to_numpy())
-
-
 def test_nothing_to_compare_is_a_sentence(reader: Reader) -> None:
     with pytest.raises(AnalysisError, match="only random is selected"):
         compare_policies(reader, select(reader, Filter(policies=("random",))))
@@ -138,30 +137,27 @@ def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mean", "error", "text"),
+    ("words", "text"),
     [
-        (12.345, 0.567, "12.35 ± 0.57"),
-        (1234.5, 56.7, "1234 ± 57"),
-        (0.01234, 0.00056, "0.01234 ± 0.00056"),
-        (4.021e-5, 6.2e-6, "(4.02 ± 0.62)e-05"),
-        (2.0, math.nan, "2.00"),
-        (math.nan, math.nan, "–"),
+        (plus_minus(12.345, 0.567), "12.35 ± 0.57"),
+        (plus_minus(1234.5, 56.7), "1234 ± 57"),
+        (plus_minus(0.01234, 0.00056), "0.01234 ± 0.00056"),
+        (plus_minus(4.021e-5, 6.2e-6), "(4.02 ± 0.62)e-05"),
+        (plus_minus(2.0, math.nan), "2.00"),
+        (plus_minus(math.nan, math.nan), "–"),
+        (number(0.5), "0.500"),
+        (number(1234.0), "1230"),
+        (number(0.0123456), "0.0123"),
+        (number(0.9996), "1.00"),
+        (number(999.6), "1000"),
+        (number(1.5e-7), "1.50e-07"),
+        (number(0.0), "0"),
+        (p_text(0.0123), "0.012"),
+        (p_text(3.21e-9), "3e-09"),
     ],
 )
-def test_plus_minus(mean: float, error: float, text: str) -> None:
-    assert plus_minus(mean, error) == text
-
-
-def test_numbers() -> None:
-    assert number(0.5) == "0.500"
-    assert number(1234.0) == "1230"
-    assert number(0.0123456) == "0.0123"
-    assert number(0.9996) == "1.00"
-    assert number(999.6) == "1000"
-    assert number(1.5e-7) == "1.50e-07"
-    assert number(0.0) == "0"
-    assert p_text(0.0123) == "0.012"
-    assert p_text(3.21e-9) == "3e-09"
+def test_numbers_as_words(words: str, text: str) -> None:
+    assert words == text
 
 
 def test_markdown_shows_counts_and_dashes() -> None:
@@ -202,11 +198,6 @@ def test_every_caption_says_what_is_divided_by_what() -> None:
     assert "Ratio: variant / reference" in explained
     assert "below 1 the variant is better" in explained
     assert "variant / reference: left of the line, below 1, the variant is better" in CAPTION
-
-
-def test_count_text() -> None:
-    assert count_text({"a": "5", "b": "5"}) == "n = 5"
-    assert count_text({"a": "5", "b": "4/5, 1 diverged", "c": "5"}) == ("n = 5; b: 4/5, 1 diverged")
 
 
 LEARNER = {"name": "gauss_newton"}
@@ -259,9 +250,6 @@ def test_a_database_without_a_finished_trial_is_refused(
     assert "No selected trial is done" in capsys.readouterr().err
 
 
-Edit = Callable[[TrialSpec, TrialResult], TrialResult]
-
-
 @pytest.fixture
 def part(reader: Reader) -> Selection:
     return control_part(select(reader, Filter()))
@@ -305,7 +293,7 @@ def test_the_numbers_follow_from_the_trials(reader: Reader, part: Selection) -> 
         lambda reader, part: control_of(reader, part, "pendulum")["cost"].to_numpy(),
         lambda reader, part: relative_costs(reader, part.entries[0]).values,
         lambda reader, part: list(scores_at(reader, part.entries[0], 20).by_seed.items()),
-        lambda reader, part: dataclasses.astuple(true_model(reader, part.entries)),
+        lambda reader, part: list(true_model(reader, part.entries).values()),
     ],
 )
 def test_what_is_finished_during_a_read_is_not_in_a_part_of_it(
@@ -376,26 +364,17 @@ def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
         assert control_of(reader, part, "pendulum").loc["random", "n"].tolist() == [3, 3, 3]
 
 
-def valued(
-    measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int, value: float
-) -> Edit:
-    """Return an edit that gives a measure of some trials a value."""
-
-    def edit(spec: TrialSpec, result: TrialResult) -> TrialResult:
-        if spec.policy.name not in policies or spec.seed not in seeds:
-            return result
-        rows = (
-            row._replace(value=value) if (row.t, row.measure) == (t, measure) else row
-            for row in result.assessments
-        )
-        return dataclasses.replace(result, assessments=tuple(rows))
-
-    return edit
-
-
 def overflown(measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int) -> Edit:
     """Return an edit that makes a number infinite, as the episode of a crashed plant has it."""
-    return valued(measure, policies, seeds, t, np.inf)
+    return valued(
+        lambda spec, row: (
+            np.inf
+            if (row.t, row.measure) == (t, measure)
+            and spec.policy.name in policies
+            and spec.seed in seeds
+            else None
+        )
+    )
 
 
 def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
@@ -440,21 +419,18 @@ def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> 
 def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal",), range(3), **SHORT, **TASK)
     specs += make_grid(("pendulum",), ("random",), range(5), **SHORT, **TASK)
-    policies = ("d_optimal", "random")
-    missed = valued("true_model_success", policies, (0, 4), 0, 0.0)
-    crashed = overflown("true_model_cost", policies, (4,), 0)
-    with filled(
-        tmp_path, specs, edit=lambda spec, result: crashed(spec, missed(spec, result))
-    ) as reader:
+    lost = {(seed, "true_model_success"): 0.0 for seed in (0, 4)} | {(4, "true_model_cost"): np.inf}
+    edit = valued(lambda spec, row: lost.get((spec.seed, row.measure)))
+    with filled(tmp_path, specs, edit=edit) as reader:
         part = control_part(select(reader, Filter()))
         truth = true_model(reader, part.of("pendulum"))
         shown = control_of(reader, part, "pendulum")
-    assert (truth.n, truth.lost) == (5, 1)  # each seed once
-    assert truth.success == pytest.approx(3 / 5)
-    assert truth.success_low < 3 / 5 < truth.success_high
+    assert (truth["n"], truth["lost"]) == (5, 1)  # each seed once
+    assert truth["success"] == pytest.approx(3 / 5)
+    assert truth["success_low"] < 3 / 5 < truth["success_high"]
     shown = shown[shown["variant"] == TRUTH]
     assert shown["t"].tolist() == [0, 20, 60]
-    assert (shown[["n", "lost", "success"]] == [truth.n, truth.lost, truth.success]).all(axis=None)
+    assert (shown[[*truth]] == [*truth.values()]).all(axis=None)
 
 
 def test_a_grid_without_a_task_has_no_such_table(tmp_path: Path) -> None:
@@ -498,17 +474,6 @@ def test_parseval(inputs: np.ndarray, dt: float) -> None:
     assert frequency[-1] <= 0.5 / dt * (1 + 1e-12)
 
 
-def test_a_sine_on_the_grid_is_one_line_of_half_its_squared_amplitude() -> None:
-    dt, steps, cycles = 0.02, 500, 7
-    time = dt * np.arange(steps)
-    wave = 3 * np.sin(2 * np.pi * cycles / (steps * dt) * time)
-    frequency, density = periodogram(wave[None, :, None], dt)
-    peak = np.argmax(density[0])
-    assert frequency[peak] == pytest.approx(cycles / (steps * dt))
-    assert density[0, peak] * frequency[1] == pytest.approx(9 / 2)
-    assert np.delete(density[0], peak).max() < 1e-20
-
-
 def test_white_noise_is_flat_at_its_variance_over_the_nyquist_frequency() -> None:
     dt, variance = 0.02, 4.0
     noise = np.sqrt(variance) * np.random.default_rng(0).normal(size=(400, 200, 1))
@@ -549,52 +514,47 @@ def test_a_line_is_never_drawn_across_the_panel(steps: list[float], centre: floa
     assert breaks == np.count_nonzero(np.diff(turns(angle, centre)))
 
 
-def test_a_crossing_reaches_both_edges_at_the_interpolated_height() -> None:
-    line = wrapped_line(np.array([[math.pi - 1, 0.0], [math.pi + 3, 4.0]]), 0)
-    expected = np.array(
-        [[math.pi - 1, 0], [math.pi, 1], [np.nan, np.nan], [-math.pi, 1], [-math.pi + 3, 4]]
-    )
-    assert line == pytest.approx(expected, nan_ok=True)
+NAN = math.nan
 
 
-def test_a_crossing_to_the_other_side() -> None:
-    line = wrapped_line(np.array([[-math.pi + 1, 0.0], [-math.pi - 1, 2.0]]), 0)
-    assert line[1] == pytest.approx([-math.pi, 1])
-    assert line[3] == pytest.approx([math.pi, 1])
-
-
-def test_the_second_coordinate_can_be_the_angle() -> None:
-    line = wrapped_line(np.array([[0.0, 0.0], [1.0, 4.0]]), 1)
-    assert line[1] == pytest.approx([math.pi / 4, math.pi])
-    assert line[-1] == pytest.approx([1.0, 4.0 - TURN])
-
-
-def test_more_than_a_turn_in_a_step_is_a_plain_break() -> None:
-    line = wrapped_line(np.array([[0.0, 0.0], [3 * TURN, 1.0]]), 0)
-    assert line == pytest.approx(np.array([[0, 0], [np.nan, np.nan], [0, 1]]), nan_ok=True)
-
-
-def test_a_line_within_one_turn_stays_as_it_is() -> None:
-    points = np.array([[3.0, 1.0], [-3.0, 2.0], [0.0, 3.0]])
-    assert np.array_equal(wrapped_line(points, 0), points)
+@pytest.mark.parametrize(
+    ("points", "axis", "drawn"),
+    [
+        (  # both edges are reached at the interpolated height
+            [[math.pi - 1, 0], [math.pi + 3, 4]],
+            0,
+            [[math.pi - 1, 0], [math.pi, 1], [NAN, NAN], [-math.pi, 1], [3 - math.pi, 4]],
+        ),
+        (
+            [[1 - math.pi, 0], [-math.pi - 1, 2]],
+            0,
+            [[1 - math.pi, 0], [-math.pi, 1], [NAN, NAN], [math.pi, 1], [math.pi - 1, 2]],
+        ),
+        (
+            [[0, 0], [1, 4]],
+            1,
+            [[0, 0], [math.pi / 4, math.pi], [NAN, NAN], [math.pi / 4, -math.pi], [1, 4 - TURN]],
+        ),
+        ([[0, 0], [3 * TURN, 1]], 0, [[0, 0], [NAN, NAN], [0, 1]]),  # more than a turn in a step
+        ([[3, 1], [-3, 2], [0, 3]], 0, [[3, 1], [-3, 2], [0, 3]]),
+    ],
+)
+def test_a_line_breaks_at_the_edges_by_hand(
+    points: list[list[float]], axis: int, drawn: list[list[float]]
+) -> None:
+    line = wrapped_line(np.array(points, float), axis)
+    assert line == pytest.approx(np.array(drawn), nan_ok=True)
 
 
 def test_frequencies_inputs_and_counts(reader: Reader) -> None:
     spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
-    by_name = {one.policy: one for one in spectra.policies}
-    assert (by_name["random"].spectrum.n, by_name["random"].n_diverged) == (4, 1)
+    assert spectra.by_policy["random"][["n", "n_diverged"]].iloc[0].tolist() == [4, 1]
     assert spectra.unit == "N"
     # cart and pole about hanging: below this, the pole alone on a fixed cart swings slower
     assert spectra.eigenfrequency is not None
     assert spectra.eigenfrequency > math.sqrt(10) / (2 * math.pi)
-
-
-def test_the_power_of_a_bang_bang_input_is_its_bound_squared(reader: Reader) -> None:
-    spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
-    table = tabulate_spectra(spectra)
-    rows = table[table.policy == "d_optimal"]
-    spacing = rows.frequency_hz.iloc[1]
-    assert rows["mean"].sum() * spacing == pytest.approx(spectra.gamma**2)
+    rows = spectra.by_policy["d_optimal"]  # bang-bang: its power is the bound squared
+    assert rows["mean"].sum() * rows.frequency_hz.iloc[1] == pytest.approx(spectra.gamma**2)
     assert np.all(rows["quantile_10"] <= rows["quantile_90"])
 
 
@@ -603,11 +563,6 @@ def test_a_policy_of_which_every_trial_diverged_is_named(tmp_path: Path) -> None
     lost = {spec.trial_key: 9 for spec in specs if spec.policy.name == "random"}
     with filled(tmp_path, specs, diverged=lost) as reader:
         spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
-    assert [one.policy for one in spectra.policies] == ["d_optimal"]
+    assert set(spectra.table["policy"]) == {"d_optimal"}
     assert spectra.diverged == ("random",)
     assert "Not drawn, because every trial diverged: random." in spectrum_caption(spectra)
-
-
-def test_unit_of() -> None:
-    assert unit_of("u [N m]") == "N m"
-    assert unit_of("u", "") == ""

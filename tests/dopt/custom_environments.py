@@ -51,15 +51,18 @@ class PointEnv(gymnasium.Env):
         return np.concatenate([self.place, self.speed]), 0.0, hit, False, {}
 
 
-for identity, settings in {
-    "Point": {"wall": 1e9},
-    "Walled": {},
-    "Buttons": {"actions": "discrete"},
-}.items():
-    if f"dopt_tests/{identity}-v0" not in gymnasium.registry:
-        gymnasium.register(
-            f"dopt_tests/{identity}-v0", PointEnv, kwargs=settings, max_episode_steps=7
-        )
+def register(
+    kind: type[gymnasium.Env], identity: str = "", most: int | None = None, **settings: Any
+) -> None:
+    """Register an environment, by the name of its class or another, with its most steps."""
+    identity = f"dopt_tests/{identity or kind.__name__}-v0"
+    if identity not in gymnasium.registry:
+        gymnasium.register(identity, kind, kwargs=settings, max_episode_steps=most)
+
+
+register(PointEnv, "Point", 7, wall=1e9)
+register(PointEnv, "Walled", 7)
+register(PointEnv, "Buttons", 7, actions="discrete")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,39 +266,13 @@ class OneBuffer(PointEnv):
         return self.buffer, *rest
 
 
-FAR: dict[str, Any] = {"wall": 1e9}
-for kind, settings in {
-    Whole: {},
-    Truncating: {},
-    Restarting: {},
-    OldReset: FAR,
-    OldResetTwo: FAR,
-    FourValues: FAR,
-    NotFinite: FAR,
-    Failing: FAR,
-    Tau: FAR,
-    OneSided: {},
-    Seedless: FAR,
-    Shaken: FAR,
-    ShakenByPython: FAR,
-    Writing: FAR,
-    OneBuffer: {},
-}.items():
-    if f"dopt_tests/{kind.__name__}-v0" not in gymnasium.registry:
-        gymnasium.register(f"dopt_tests/{kind.__name__}-v0", kind, kwargs=dict(settings))
-for identity, settings in {"Single": {"after": 1}, "Near": {"spread": 2.0}}.items():
-    if f"dopt_tests/{identity}-v0" not in gymnasium.registry:
-        gymnasium.register(f"dopt_tests/{identity}-v0", Restarting, kwargs=dict(settings))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rough(Point):
-    """A point mass far from everything."""
-
-    name: ClassVar[str] = "rough"
-
-    grid_half_widths: tuple[float, ...] = parameter((60.0,), bound="positive")
-
+for kind in (OldReset, OldResetTwo, FourValues, NotFinite, Failing, Tau, Seedless, Shaken,
+             ShakenByPython, Writing):  # fmt: skip
+    register(kind, wall=1e9)
+for kind in (Whole, Truncating, Restarting, OneSided, OneBuffer):
+    register(kind)
+register(Restarting, "Single", after=1)
+register(Restarting, "Near", spread=2.0)
 
 SEEN: list[Any] = []
 """Accelerations that :class:`Noting` was taught last, (T, r)."""

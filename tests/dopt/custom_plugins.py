@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -43,9 +44,19 @@ class CopyPlanner(Planner):
         self._information = before + J.T @ J
 
 
+class Answer(Planner):
+    """A plan that is a function of what a trial shows."""
+
+    def __init__(self, choose: Callable[[TrialView], Array]) -> None:
+        self._choose = choose
+
+    def choose(self, view: TrialView) -> Array:
+        return self._choose(view)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Wild(CustomPolicy):
-    """Chooses what it may not: ``scale`` times γ, in ``size`` inputs; or gets lost."""
+    """Chooses what it may not: ``scale`` times γ, in ``size`` inputs."""
 
     name: ClassVar[str] = "wild"
 
@@ -53,23 +64,21 @@ class Wild(CustomPolicy):
     size: int = 1
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return WildPlanner(system.gamma * self.scale, self.size)
+        return self.late(np.full(self.size, system.gamma * self.scale))
 
-
-class WildPlanner(Planner):
-    def __init__(self, value: float, size: int) -> None:
-        self._inputs = np.full(size, value)
-
-    def choose(self, view: TrialView) -> Array:
-        return np.where(view.t < 5, 0.0, self._inputs) if len(self._inputs) == 1 else self._inputs
+    def late(self, inputs: Array) -> Planner:
+        """Return a plan that chooses an input of the right size from step 5 on."""
+        return Answer(lambda view: inputs if view.t >= 5 or self.size > 1 else 0.0 * view.inputs[0])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lost(Wild):
+    """Gets lost."""
+
     name: ClassVar[str] = "lost"
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return WildPlanner(np.nan, 1)
+        return self.late(np.array([np.nan]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,16 +88,8 @@ class Coin(CustomPolicy):
     name: ClassVar[str] = "coin"
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
-        return CoinPlanner(system.gamma, rng)
-
-
-class CoinPlanner(Planner):
-    def __init__(self, gamma: float, rng: np.random.Generator) -> None:
-        self._gamma, self._rng = gamma, rng
-
-    def choose(self, view: TrialView) -> Array:
-        m = view.inputs.shape[1]
-        return self._rng.choice([-self._gamma, self._gamma], size=m) / np.sqrt(m)
+        sides, m = [-system.gamma, system.gamma], system.n_inputs
+        return Answer(lambda _: rng.choice(sides, size=m) / np.sqrt(m))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,36 +99,22 @@ class Tampering(CustomPolicy):
     name: ClassVar[str] = "tampering"
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return TamperingPlanner()
-
-
-class TamperingPlanner(Planner):
-    def choose(self, view: TrialView) -> Array:
-        view.states[0] = 0.0
-        return view.inputs[-1]
+        return Answer(lambda view: np.negative(view.states[0, :1], out=view.states[0, :1]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Misasking(CustomPolicy):
-    """Asks for the states that follow with one axis too many."""
+    """Asks for what follows, or for a Jacobian, with one axis too many."""
 
     name: ClassVar[str] = "misasking"
 
     of_inputs: int = 0
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return MisaskingPlanner(self.of_inputs)
-
-
-class MisaskingPlanner(Planner):
-    def __init__(self, of_inputs: int) -> None:
-        self._of_inputs = of_inputs
-
-    def choose(self, view: TrialView) -> Array:
-        x, m = view.states[-1:], view.system.n_inputs
-        if self._of_inputs:
-            return view.following(x[0], np.zeros((1, m + 1)))
-        return view.jacobian(x)
+        inputs = np.zeros((1, system.n_inputs + 1))
+        if self.of_inputs:
+            return Answer(lambda view: view.following(view.states[-1], inputs))
+        return Answer(lambda view: view.jacobian(view.states[-1:]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,24 +136,23 @@ class Asking(CustomPolicy):
     name: ClassVar[str] = "asking"
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return AskingPlanner()
+        return Answer(asked)
 
 
-class AskingPlanner(Planner):
-    def choose(self, view: TrialView) -> Array:
-        x, u = view.states[-1], view.system.gamma * view.tie
-        matrix = view.input_matrix(x)
-        answers = {
-            "predict": view.predict(view.states[::-1]),  # not contiguous
-            "jacobian": view.jacobian(x),
-            "jacobian_change": view.jacobian_change(x, matrix.T),
-            "following": view.following(x, np.array([u, -0.5 * u])),
-            "input_matrix": matrix,
-        }
-        given = ("states", "inputs", "sampled_inputs", "sampled", "accelerations", "parameters")
-        answers |= {name: np.array(getattr(view, name)) for name in given}
-        ANSWERS.append(answers)
-        return u
+def asked(view: TrialView) -> Array:
+    """Ask a view all that it answers, keep that, and return a random direction."""
+    x, u = view.states[-1], view.system.gamma * view.tie
+    matrix = view.input_matrix(x)
+    answers = {
+        "predict": view.predict(view.states[::-1]),  # not contiguous
+        "jacobian": view.jacobian(x),
+        "jacobian_change": view.jacobian_change(x, matrix.T),
+        "following": view.following(x, np.array([u, -0.5 * u])),
+        "input_matrix": matrix,
+    }
+    given = ("states", "inputs", "sampled_inputs", "sampled", "accelerations", "parameters")
+    ANSWERS.append(answers | {name: np.array(getattr(view, name)) for name in given})
+    return u
 
 
 @dataclass(frozen=True, kw_only=True)

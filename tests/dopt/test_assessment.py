@@ -69,30 +69,24 @@ def test_every_measure_is_there_at_every_step(done: TrialResult) -> None:
     assert set(found) == expected
 
 
-def test_the_parameters_are_those_of_the_replay(done: TrialResult) -> None:
-    again = rerun(short("pendulum", "d_optimal"), [10, 30])
-    np.testing.assert_array_equal(done.checkpoints[10], again.parameters[0])
-    np.testing.assert_array_equal(done.checkpoints[30], done.parameters)
-
-
 def test_pieces_and_repetition_change_nothing(
     done: TrialResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "FIRST_STEPS", 3)
     monkeypatch.setattr(run, "PIECE_SECONDS", 1e-9)
     assert run_trial(short("pendulum", "d_optimal")).assessments == done.assessments
+    again = rerun(short("pendulum", "d_optimal"), [10, 30])
+    np.testing.assert_array_equal(done.checkpoints[10], again.parameters[0])
+    np.testing.assert_array_equal(done.checkpoints[30], done.parameters)
 
 
-def test_exploration_does_not_notice_that_it_is_assessed(done: TrialResult) -> None:
+def test_exploration_does_not_notice_that_and_when_it_is_assessed(done: TrialResult) -> None:
+    more = run_trial(short("pendulum", "d_optimal", checkpoints=[5, 10, 20])).assessments
+    assert set(done.assessments) < set(more)
     plain = run_trial(trial("pendulum", "d_optimal", 1))
     assert plain.assessments == ()
     for name in ("loss", "reachable_loss", "states", "inputs", "parameters"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(done, name))
-
-
-def test_the_other_steps_change_nothing(done: TrialResult) -> None:
-    more = run_trial(short("pendulum", "d_optimal", checkpoints=[5, 10, 20])).assessments
-    assert set(done.assessments) < set(more)
 
 
 def test_both_paths_and_the_batch_agree(done: TrialResult) -> None:
@@ -109,29 +103,23 @@ def test_both_paths_and_the_batch_agree(done: TrialResult) -> None:
         )
 
 
-def test_policies_of_one_seed_share_what_is_not_theirs(done: TrialResult) -> None:
-    other = run_trial(short("pendulum", "random")).assessments
-    shared = [row for row in done.assessments if row.t == 0]
-    assert [row for row in other if row.t == 0] == shared
-    assert [row for row in other if row.t] != [row for row in done.assessments if row.t]
-    assert run_trial(short("pendulum", "random", 2)).assessments[1] != other[1]
-
-
-def test_what_policies_share_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = run_trial(short("pendulum", "random", 7))
-    episodes = []
-    whole = assessment.run_episode
+def test_policies_of_one_seed_share_what_is_not_theirs(
+    done: TrialResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And do not compute it again."""
+    episodes, whole = [], assessment.run_episode
 
     def counted(*arguments: object) -> object:
         episodes.append(arguments)
         return whole(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(assessment, "run_episode", counted)
-    second = run_trial(short("pendulum", "d_optimal", 7))
+    other = run_trial(short("pendulum", "random")).assessments
     assert len(episodes) == 2  # of those after 0, 10 and 30 steps and with the true model
-    assert [row for row in second.assessments if row.t == 0] == [
-        row for row in first.assessments if row.t == 0
-    ]
+    shared = [row for row in done.assessments if row.t == 0]
+    assert [row for row in other if row.t == 0] == shared
+    assert [row for row in other if row.t] != [row for row in done.assessments if row.t]
+    assert run_trial(short("pendulum", "random", 2)).assessments[1] != other[1]
 
 
 def test_with_the_true_model_learned_both_costs_are_one() -> None:
@@ -175,18 +163,22 @@ class Round(Turned):
     angle_indices: ClassVar[tuple[int, ...]] = (0, 2)
 
 
-def test_one_cell_of_four() -> None:
-    assert coverage(np.array([[-0.5, 1.0], [-0.6, 1.1]]), BOX, cells=2) == 0.25
+EVERYWHERE = list(itertools.product(np.linspace(-0.95, 0.95, 20), np.linspace(0.1, 3.9, 20)))
 
 
-def test_a_point_in_every_cell_is_everything() -> None:
-    x, y = np.meshgrid(np.linspace(-0.95, 0.95, 20), np.linspace(0.1, 3.9, 20))
-    assert coverage(np.stack([x.ravel(), y.ravel()], axis=1), BOX) == 1.0
-
-
-def test_points_outside_and_after_a_divergence_count_nowhere() -> None:
-    points = np.array([[-1.5, 1.0], [0.5, 5.0], [np.nan, np.nan], [0.5, np.nan]])
-    assert coverage(points, BOX, cells=4) == 0.0
+@pytest.mark.parametrize(
+    ("points", "cells", "share"),
+    [
+        ([[-0.5, 1.0], [-0.6, 1.1]], 2, 0.25),
+        (EVERYWHERE, 20, 1.0),
+        ([[-1.5, 1.0], [0.5, 5.0], [np.nan, np.nan], [0.5, np.nan]], 4, 0.0),
+    ],
+)
+def test_coverage_counts_the_cells_in_which_a_point_lies(
+    points: Any, cells: int, share: float
+) -> None:
+    """Points outside and after a divergence lie in none."""
+    assert coverage(np.array(points), BOX, cells=cells) == share
 
 
 def test_an_axis_on_which_nothing_is_judged_has_what_can_be_reached() -> None:
@@ -197,10 +189,7 @@ def test_an_axis_on_which_nothing_is_judged_has_what_can_be_reached() -> None:
     plane = Plane.of(cart)
     assert plane.box == ((reached.min(), reached.max()), cart.grid_box()[1])
     assert plane.coverage(reachable_states(cart)) > 0.1
-
-
-def test_an_angle_on_which_nothing_is_judged_has_a_whole_turn() -> None:
-    assert Plane.of(Round()).box[0] == pytest.approx((-math.pi, math.pi))
+    assert Plane.of(Round()).box[0] == pytest.approx((-math.pi, math.pi)), "a whole turn"
 
 
 NAMES = sorted(SYSTEMS)
@@ -215,6 +204,9 @@ def test_reachable_states_are_a_function_of_the_system_alone(name: str) -> None:
     quiet = dataclasses.replace(system, noise=0.0, grid_points=(1,) * len(system.grid_points))
     assert np.array_equal(first, reachable_states(quiet))
     assert first.shape == (512, system.n_states)
+    # The sample has a state at most as often as the runs, some of which begin alike.
+    visited, _ = visited_points(system, np.random.default_rng(_SEED))
+    assert Counter(map(tuple, first.tolist())) <= Counter(map(tuple, visited.tolist()))
 
 
 def test_a_long_horizon_adds_no_runs_and_is_part_of_the_key_of_a_trial() -> None:
@@ -223,16 +215,6 @@ def test_a_long_horizon_adds_no_runs_and_is_part_of_the_key_of_a_trial() -> None
     keys = [trial("pendulum", "random", env={"horizon": s.horizon}) for s in (longest, longer)]
     versions = [json.loads(spec.config_json).get("reachable_version") for spec in keys]
     assert versions == [None, REACHABLE_VERSION]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_visited_state_is_drawn_twice(name: str) -> None:
-    """The sample has a state at most as often as the runs, some of which begin alike."""
-    system = SYSTEMS[name]()
-    visited, _ = visited_points(system, np.random.default_rng(_SEED))
-    visits = Counter(map(tuple, visited.tolist()))
-    sample = Counter(map(tuple, reachable_states(system).tolist()))
-    assert sample <= visits
 
 
 @pytest.mark.parametrize("name", ["pendulum", "cartpole", "arm"])
@@ -247,14 +229,6 @@ def test_the_reachable_set_has_states_that_the_square_wave_visits(name: str) -> 
     reached = {state.tobytes() for state in reachable_states(system)}
     shared = sum(state.tobytes() in reached for state in wave)
     assert 0.05 * len(reached) < shared < 0.25 * len(reached)
-
-
-def test_a_pendulum_is_never_faster_than_its_terminal_speed() -> None:
-    pendulum = Pendulum(gamma=4.0)
-    weight = pendulum.mass * pendulum.gravity * pendulum.length / 2
-    terminal = (pendulum.gamma + weight) / pendulum.friction
-    speeds = np.abs(reachable_states(pendulum)[:, 1])
-    assert 1.0 < speeds.max() <= terminal
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -285,13 +259,9 @@ def test_the_truth_at_the_points_is_that_of_the_system(name: str) -> None:
     assert points.accelerations[::50] == pytest.approx(known, rel=1e-10, abs=1e-9)
 
 
-def test_a_step_too_long_for_the_system_warns_of_nothing() -> None:
-    """States that overflow are left out, without a warning on the way (warnings are errors)."""
-    wild = Pendulum(dt=50.0, horizon=400)
-    assert np.isfinite(evaluation_set(wild).states).all()
-
-
-def test_no_state_within_the_limit_leaves_the_grid_alone() -> None:
+def test_states_that_overflow_or_are_beyond_the_limit_are_left_out() -> None:
+    """Without a warning on the way (warnings are errors)."""
+    assert np.isfinite(evaluation_set(Pendulum(dt=50.0, horizon=400)).states).all()
     points = evaluation_set(Pendulum(state_limit=1e-9, initial_state=(1.0, 0.0)))
     assert len(points.states) == points.n_grid
 

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from dopt import Explorer
 from dopt.errors import IncompatibleError
-from dopt.kernel.evidence import Request, evenly, fit_numbers, fit_rows, guessed
+from dopt.kernel.evidence import fit_numbers, guessed
 from dopt.kernel.gaussian_process import negative_evidence
 from dopt.kernel.run import trial_in_kernel
 from dopt.models import gaussian_process
@@ -21,8 +21,7 @@ from dopt.offline_fit import fit_offline, grid_loss, recorded_samples
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from tests.dopt.explorer.plants import MOTOR, motor_acceleration
-from tests.dopt.explorer.plants import following as next_state
+from tests.dopt.explorer.plants import MOTOR, drive, motor_acceleration
 from tests.dopt.oracles.traces import following, trace
 from tests.dopt.trials import trial
 
@@ -178,19 +177,6 @@ def test_numbers_that_leave_the_matrix_indefinite_do_not_come_into_force() -> No
     assert one.parameters == pytest.approx(parameters, rel=1e-6, abs=1e-6 * parameters.max())
 
 
-def test_fits_take_an_even_choice() -> None:
-    assert evenly(5, 9).tolist() == [0, 1, 2, 3, 4]
-    assert evenly(1001, 5).tolist() == [0, 250, 500, 750, 1000]
-
-
-def explore(one: Explorer, steps: int, x: Array) -> Array:
-    for _ in range(steps):
-        u = one.ask(x)
-        x = next_state(x, u)
-        one.tell(x)
-    return x
-
-
 PARTS: dict[str, Any] = {
     "policy": "exact",
     "model": {"name": "gaussian_process", "hyperparameters": "evidence"},
@@ -201,19 +187,13 @@ PARTS: dict[str, Any] = {
 def test_an_exploration_refits_beside_the_rig_and_its_journal_replays(tmp_path: Path) -> None:
     journal, begin = tmp_path / "rig.journal", np.array([0.1, 0.0])
     with Explorer(MOTOR, steps=90, journal=journal, **PARTS) as one:
-        x = explore(one, 60, begin)
+        x = drive(one, 60, begin)
         assert one.counts["refits"] >= 5
         before = one.parameters.copy()
     with Explorer(MOTOR, steps=90, journal=journal, **PARTS) as again:
         assert np.array_equal(again.parameters, before)
-        explore(again, 30, x)
+        drive(again, 30, x)
         states = np.random.default_rng(0).uniform(-1, 1, (40, 2)) * [np.pi, 5.0]
         truth = np.array([motor_acceleration(x) for x in states])
         error = again.predict(states)[:, 0] - truth
         assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(truth**2))
-
-
-def test_a_request_is_a_copy_that_travels() -> None:
-    phi, y, counts, numbers = drawn(1)
-    request = Request(phi, y[None], counts, numbers[None, None], None)
-    assert fit_rows(request).shape == (1, len(numbers))

@@ -17,7 +17,6 @@ from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems.black_box import delay, differentiated
 from dopt.types import Array
 from tests.dopt.trials import trial
 
@@ -47,13 +46,6 @@ def test_inputs_stay_within_their_box_and_rates(policy: str) -> None:
     assert np.abs(changes).max() == pytest.approx(150.0 * spec.system.dt)
 
 
-def test_inputs_of_several_axes_stay_within_the_ball() -> None:
-    spec = limited("quadrotor", {"rates": {"u₁": 3.0, "u₂": 40.0}}, "random")
-    result = run_trial(spec)
-    assert np.linalg.norm(result.inputs, axis=1).max() <= spec.system.gamma * (1 + 1e-12)
-    assert np.abs(np.diff(result.inputs[:, 0])).max() <= 3.0 * spec.system.dt * (1 + 1e-9)
-
-
 def test_a_model_that_is_right_breaks_no_bound() -> None:
     """The oracle's model is exact after a few samples, so that no margin is needed."""
     limits = {"bounds": {"y": [-1.5, 1.5]}, "margin": 0.0}
@@ -63,6 +55,7 @@ def test_a_model_that_is_right_breaks_no_bound() -> None:
 
 
 def test_limits_that_are_not_enforced_change_nothing_and_are_counted() -> None:
+    assert "measured" not in limited("cartpole", None).config_json
     counted = run_trial(limited("cartpole", TIGHT | {"enforced": False}, horizon=200))
     plain = run_trial(limited("cartpole", None, horizon=200))
     assert np.array_equal(counted.inputs, plain.inputs)
@@ -133,20 +126,16 @@ def test_violations_of_a_diverged_trial_are_those_before() -> None:
     assert measures(result)["worst"] == pytest.approx(beyond.max())
 
 
-def test_limits_are_checked_however_they_are_made() -> None:
-    assert Limits(bounds=(("y", -1, 1),)) == Limits.from_section({"bounds": {"y": (-1, 1)}})
-    assert Limits.from_section({"bounds": {"y": np.array([-1, 1])}}).bounds == (("y", -1.0, 1.0),)
-    with pytest.raises(SpecificationError, match=r"bounds\.y is \[2\.0, -2\.0\]"):
-        Limits(bounds=(("y", 2.0, -2.0),))
-
-
 def test_sections_describe_their_limits() -> None:
     spec = limited("cartpole", TIGHT | {"steps": 20})
     assert TrialSpec.from_mapping(spec.to_mapping()) == spec
     assert spec.limits == Limits(
         bounds=(("y", -0.3, 0.3), ("u", -5.0, 6.0)), rates=(("u", 150.0),), steps=20
     )
-    one_sided = Limits.from_section({"bounds": {"y": [None, 2]}})
+    assert Limits(bounds=(("y", -1, 1),)) == Limits.from_section({"bounds": {"y": (-1, 1)}})
+    with pytest.raises(SpecificationError, match=r"bounds\.y is \[2\.0, -2\.0\]"):
+        Limits(bounds=(("y", 2.0, -2.0),))
+    one_sided = Limits.from_section({"bounds": {"y": [None, np.int64(2)]}})
     assert one_sided.to_section()["bounds"] == {"y": [None, 2.0]}
     assert limited("cartpole", {"name": "none"}).limits is None
     assert "limits" not in limited("cartpole", None).config_json
@@ -235,18 +224,6 @@ def observed(spec: TrialSpec) -> tuple[Record, Array]:
 EXACT = {"measurement_noise": [1e-13], "noise": 0.0}
 
 
-def test_filtered_differences_see_the_filtered_accelerations() -> None:
-    """Without noise: what the filter gives for v̇ less the known part is what it gives for a(x)."""
-    sensors = {"measured_states": [0], "initial_state": [1.0, 4.0], **EXACT}
-    spec = sensed("pendulum", sensors, "adam", "random", horizon=40)
-    system, (record, targets) = spec.system, observed(spec)
-    share, filtered, expected = -math.expm1(-2 * math.pi * 2.0 * system.dt), 0.0, []
-    for acceleration in system.learned(record.true_states[:-1])[:, 0]:
-        expected.append(filtered)  # differences come one step late
-        filtered += share * (acceleration - filtered)
-    np.testing.assert_allclose(targets[:, 0], expected, atol=1e-8)
-
-
 @pytest.mark.parametrize(
     ("env", "sensors"),
     [
@@ -267,27 +244,6 @@ def test_estimates_belong_together(env: str, sensors: dict[str, Any]) -> None:
     assert late < 0.01
 
 
-def test_differences_come_late_by_the_step_of_the_integrator() -> None:
-    systems = [sensed("pendulum", ANGLE | more).system for more in ({}, {"integrator": "rk4"})]
-    assert [delay(system) for system in systems] == [1.0, 0.5]
-    both = sensed("pendulum", {"measured_states": [0, 1], "measurement_noise": [0.1, 0.1]})
-    assert delay(both.system) == 0.0
-
-
-def test_rates_of_measured_states_are_found() -> None:
-    assert differentiated(sensed("pendulum", ANGLE).system) == [0, 0]
-    assert differentiated(sensed("cartpole", CART).system) == [0, 0, 2, 2]
-    rate = {"measured_states": [1], "measurement_noise": [0.1]}
-    assert differentiated(sensed("pendulum", rate).system) == [-1, 1]
-
-
-def test_without_measured_states_nothing_is_estimated() -> None:
-    spec = sensed("pendulum", {}, "adam_window")
-    assert run_trial(spec).estimated_states is None
-    assert "measured" not in spec.config_json
-    assert "velocity_cutoff" not in spec.config_json
-
-
 def test_a_trial_that_diverges_has_no_estimates_from_there_on() -> None:
     sensors = ANGLE | {"state_limit": 0.05}
     result = run_trial(sensed("pendulum", sensors, horizon=60, refit_every=1000))
@@ -303,6 +259,10 @@ REFUSED = [
     ({"measured_states": [0]}, "joint_ekf", "measurement_noise has 0 entries"),
     ({"measured_states": [0], "measurement_noise": [0.0]}, "joint_ekf", "above 0"),
     (ANGLE | {"velocity_cutoff": 0.0}, "adam", "above 0"),
+    (ANGLE | {"output_matrix": [1.0, 0.0]}, "joint_ekf", "one of the two is expected"),
+    ({"output_matrix": [1.0], "measurement_noise": [0.1]}, "joint_ekf", "2 for each output"),
+    ({"output_matrix": [0, 0], "measurement_noise": [0.1]}, "joint_ekf", "no row of 2 zeros"),
+    ({"output_matrix": [1, 1]}, "joint_ekf", "0 entries, but pendulum needs 1"),
 ]
 
 

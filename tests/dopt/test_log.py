@@ -69,14 +69,15 @@ def test_frames_mappings_and_arrays_are_the_same_log() -> None:
     for found in (log(frame), log(array, columns=list(columns)), log(frame.astype("Float64"))):
         for part, same in zip(found.pieces[0], log().pieces[0], strict=True):
             np.testing.assert_array_equal(part, same)
-
-
-def test_names_may_differ_from_columns_and_their_order_is_kept() -> None:
-    found = log(
-        table(om=9 * T), states={"rate": "om", "angle": "th"}, inputs={"voltage": "u"}, time="t"
-    )
-    assert found.states == ("rate", "angle")
-    np.testing.assert_array_equal(found.pieces[0].measured[:, 0], 9 * T)
+    named = log(table(om=9 * T), states={"rate": "om", "angle": "th"}, inputs={"volt": "u"})
+    assert (named.states, named.inputs) == (("rate", "angle"), ("volt",))
+    np.testing.assert_array_equal(named.pieces[0].measured[:, 0], 9 * T)
+    spaced = log({"th": T, "u": T}, dt=0.5)
+    np.testing.assert_array_equal(spaced.pieces[0].time, 0.5 * np.arange(N))
+    assert said(log(dt=0.5), "Column 't' is not used")
+    for data, options in ((T, {}), (np.zeros((5, 2)), {"columns": ["t"]}), ("run.csv", {})):
+        with pytest.raises(SpecificationError, match="expected"):
+            log(data, **options)
 
 
 def test_the_input_is_not_shifted_and_nothing_is_resampled() -> None:
@@ -114,12 +115,6 @@ def test_a_counter_of_microseconds_that_begins_again_goes_on() -> None:
         [piece] = found.pieces
         np.testing.assert_allclose(piece.time, T, atol=1e-9)
         assert said(found, "begins again after 4294.97 s at row 100")
-
-
-def test_rows_without_stamps_are_dt_apart() -> None:
-    found = log({"th": T, "u": T}, dt=0.5)
-    np.testing.assert_array_equal(found.pieces[0].time, 0.5 * np.arange(N))
-    assert said(log(dt=0.5), "Column 't' is not used")
 
 
 def test_a_repeated_stamp_leaves_out_the_later_row() -> None:
@@ -177,11 +172,15 @@ def test_whole_numbers_truth_values_and_masked_arrays_are_numbers() -> None:
 def test_an_angle_within_a_turn_is_unwrapped(
     span: float, low: float, high: float, unit: str
 ) -> None:
+    """Also where values are missing and a gap begins another piece."""
     angle = span * np.sin(4 * T) + 1
     raw = (angle / TURN * (high - low) - low) % (high - low) + low
-    found = log(table(th=raw), angles=["th"], units={"th": unit})
-    got = found.pieces[0].measured[:, 0]
-    np.testing.assert_allclose(got - got[0], angle - angle[0], atol=1e-9)
+    raw[[40, 41]] = np.nan
+    found = log(table(th=raw, t=T + 5.0 * (T[120] <= T)), angles="th", units={"th": unit})
+    for piece, rows in zip(found.pieces, (slice(0, 120), slice(120, N)), strict=True):
+        got, truth = piece.measured[:, 0], angle[rows]
+        there = np.isfinite(got)
+        np.testing.assert_allclose(np.diff(got[there]), np.diff(truth[there]), atol=1e-9)
     assert said(found, "unwrapped")
 
 
@@ -195,18 +194,6 @@ def test_counts_become_radians_and_counters_go_on() -> None:
         np.testing.assert_allclose(got - got[0], angle - angle[0], atol=TURN / 4096)
     kept = log(table(th=counts), angles=["th"], units={"th": "counts/4096"})
     assert said(kept, "counts turns")
-
-
-def test_missing_values_and_gaps_do_not_disturb_the_unwrapping() -> None:
-    angle = 12.0 * T
-    raw = angle % TURN
-    raw[[40, 41]] = np.nan
-    t = T + 5.0 * (np.arange(N) >= 120)
-    found = log(table(th=raw, t=t), angles="th")
-    for piece, rows in zip(found.pieces, (slice(0, 120), slice(120, N)), strict=True):
-        got = piece.measured[:, 0]
-        there = np.isfinite(got)
-        np.testing.assert_allclose(np.diff(got[there]), np.diff(angle[rows][there]), atol=1e-9)
 
 
 # Plants
@@ -273,12 +260,6 @@ def test_a_fault_is_answered_by_a_sentence(
     text = str(raised.value)
     assert "expected" in text or "unknown" in text or "choose one of" in text.lower()
     assert text.endswith(".")
-
-
-def test_other_data_is_refused() -> None:
-    for data, options in ((T, {}), (np.zeros((5, 2)), {"columns": ["t"]}), ("run.csv", {})):
-        with pytest.raises(SpecificationError, match="expected"):
-            log(data, **options)
 
 
 # Where it runs

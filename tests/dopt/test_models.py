@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
 from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.explorer import Explorer
-from dopt.kernel.joint_kalman import run_filter
-from dopt.kernel.run import KernelTrial
-from dopt.models import MODELS, RFF, GaussianProcess
+from dopt.models import RFF, GaussianProcess
 from dopt.models.gaussian_process import kernel
 from dopt.offline_fit import fit_offline, grid_loss
 from dopt.randomness import PLANNED_DIMENSIONS, draw
@@ -25,11 +21,10 @@ from dopt.run import rerun, run_trial
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.kernel.twin import call, model_of_kernel
+from tests.dopt.kernel.twin import model_of_kernel
 from tests.dopt.oracles.traces import jacobian, observed, trace
-from tests.dopt.test_limits import ABSOLUTE, ANGLE, CART, DEGREE, JOINTS, sensed
-from tests.dopt.trials import trial
-from tests.dopt.uniform import uniform_samples
+from tests.dopt.test_limits import ABSOLUTE, CART, DEGREE, JOINTS, sensed
+from tests.dopt.trials import trial, uniform_samples
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
     "gaussian_process": "conditioning"
@@ -44,15 +39,6 @@ def regression(env: str, model: str, policy: str = "random_held", /, **fields: A
     for key, entries in fields.items():
         sections[key] = sections.get(key, {}) | entries
     return trial(env, policy, 5, **sections)
-
-
-@pytest.mark.parametrize("model", LEARNERS)
-def test_the_stored_parameters_give_the_last_loss(model: str) -> None:
-    spec = regression("arm", model)
-    result = run_trial(spec)
-    grid = spec.system.grid()
-    errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
-    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-5)
 
 
 def test_random_features_have_the_kernel_in_expectation() -> None:
@@ -98,11 +84,6 @@ def test_least_squares_minimise_the_ridge_loss(env: str, model: str, policy: str
     expected = np.linalg.lstsq(design, aims, rcond=None)[0]
     found = run.parameters[-1][:q]
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * np.abs(expected).max())
-
-
-def test_information_of_random_features_is_about_the_learned_parameters_alone() -> None:
-    spec = regression("arm", "rff", "d_optimal", model={"n_features": 20}, env={"horizon": 4})
-    assert KernelTrial(spec).state.covariance.size == 40
 
 
 def test_the_noise_of_a_process_is_that_of_the_trial_but_not_below_rounding() -> None:
@@ -234,21 +215,6 @@ def test_learners_that_keep_something_of_one_network_are_refused(
 ) -> None:
     with pytest.raises(IncompatibleError, match=words):
         make(ENSEMBLE, learner=learner)
-
-
-ONE_FIT: dict[str, Any] = {"noise": "fitted", "refit_every": 60, "horizon": 60}
-
-
-def test_it_is_the_likeliest_of_its_neighbours() -> None:
-    fast = KernelTrial(sensed("pendulum", ANGLE, **ONE_FIT, noise_variance=3.0))
-    fast.advance(60)
-    noise, none = fast.state.estimate.noise_variance, np.empty((0, len(fast.state.theta)))
-    fitted, lowest = float(noise[0]), call(run_filter, fast.trial, 60, none, np.empty(0))
-    moves = abs(math.log10(fitted / 3.0)) / math.log10(NOISE_FACTORS[0])
-    assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
-    for factor in NOISE_FACTORS:
-        noise[0] = factor * fitted
-        assert call(run_filter, fast.trial, 60, none, np.empty(0)) >= lowest
 
 
 READERS = ("affine", "black_box")
@@ -390,11 +356,6 @@ def test_what_reads_no_inputs_is_refused() -> None:
     small("arm", "black_box", policy={"form": "dual"})
 
 
-def test_the_models_that_read_inputs_are_these() -> None:
-    system = SYSTEMS["arm"]()
-    assert {name for name, model in MODELS.items() if model().n_inputs_read(system)} == set(READERS)
-
-
 def test_a_matrix_that_selects_states_measures_them() -> None:
     rows = {"output_matrix": [0, 0, 1, 0, 1, 0, 0, 0], "measurement_noise": [DEGREE, 0.01]}
     selected, given = (
@@ -402,27 +363,9 @@ def test_a_matrix_that_selects_states_measures_them() -> None:
     )
     assert np.array_equal(selected.inputs, given.inputs)
     assert np.array_equal(selected.parameters, given.parameters)
-
-
-def test_the_matrix_of_the_outputs_is_part_of_the_key() -> None:
     changed = ABSOLUTE | {"output_matrix": [1, 0, 0, 0, 1, 0, 2, 0]}
     specs = [sensed("arm", sensors) for sensors in (JOINTS, ABSOLUTE, changed)]
-    assert len({spec.trial_key for spec in specs}) == 3
     assert len({spec.config_key for spec in specs}) == 3
-
-
-REFUSED = [
-    (ANGLE | {"output_matrix": [1.0, 0.0]}, "one of the two is expected"),
-    ({"output_matrix": [1.0], "measurement_noise": [0.1]}, "needs 2 for each output"),
-    ({"output_matrix": [0, 0], "measurement_noise": [0.1]}, "no row of 2 zeros"),
-    ({"output_matrix": [1, 1]}, "measurement_noise has 0 entries, but pendulum needs 1"),
-]
-
-
-@pytest.mark.parametrize(("sensors", "said"), REFUSED)
-def test_matrices_that_make_no_sense_are_refused(sensors: dict[str, Any], said: str) -> None:
-    with pytest.raises(SpecificationError, match=said):
-        sensed("pendulum", sensors)
 
 
 def test_what_estimates_no_states_is_refused() -> None:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import replace
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
-from torch.func import jacrev, vmap
 
-import dopt
 from dopt import Explorer
+from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
 from dopt.assessment import loss_by_parameter_error, parameter_error, true_parameters
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.evaluation import evaluation_set
+from dopt.evaluation import evaluation_set, random_transitions
 from dopt.kernel import joint_kalman
-from dopt.kernel.joint_kalman import run_filter
+from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
 from dopt.offline_fit import (
     RIDGE,
@@ -31,22 +29,19 @@ from dopt.offline_fit import (
     recorded_samples,
 )
 from dopt.randomness import draw, initial_weights
-from dopt.reference.models import mlp_function
-from dopt.result import TrialResult
 from dopt.run import rerun, run_trial
 from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, CoupledPendulums
 from dopt.types import Array
-from tests.dopt.custom_networks import model_of_one
 from tests.dopt.explorer.plants import following
 from tests.dopt.explorer.test_measurements import ENCODER, JOINT
-from tests.dopt.kernel.twin import call, observed
-from tests.dopt.oracles.test_joint_kalman import filtered
+from tests.dopt.kernel.twin import interpreted, observed
+from tests.dopt.oracles.test_oracles import filtered
+from tests.dopt.oracles.traces import jacobian as complex_jacobian
 from tests.dopt.oracles.traces import model_step
-from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, measures, sensed
-from tests.dopt.trials import trial
-from tests.dopt.uniform import uniform_samples
+from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, sensed
+from tests.dopt.trials import trial, uniform_samples
 
 SMALL = {"width": 4, "depth": 2}
 
@@ -62,13 +57,6 @@ def taught(spec: TrialSpec, states: Array) -> tuple[Array, Array]:
     return theta, spec.model.predict(spec.system, theta, states)
 
 
-def torch_jacobian(spec: TrialSpec, theta: Array, states: Array) -> Array:
-    """Return ∂a_θ(x)/∂θ, (N r, q), by automatic differentiation."""
-    model = model_of_one(spec.system, spec.model)
-    rows = vmap(jacrev(model), in_dims=(None, 0))(torch.tensor(theta), torch.tensor(states))
-    return rows.flatten(0, 1).numpy()
-
-
 @pytest.mark.parametrize("env", ["pendulum", "arm"])
 def test_a_network_teacher_without_noise_is_recovered(env: str) -> None:
     spec = small(env, 300)
@@ -81,6 +69,8 @@ def test_a_network_teacher_without_noise_is_recovered(env: str) -> None:
     )
     assert fitted.converged
     assert fitted.residual < 1e-3 * np.std(y)
+    few = fit_offline(spec, x, y, ridge=1e-10, max_steps=3)
+    assert (few.steps, few.converged) == (3, False)
     assert np.sqrt(np.mean((found - truth) ** 2)) < 2e-3 * np.std(truth)
 
 
@@ -91,7 +81,7 @@ def test_a_fit_ends_at_a_minimum_of_its_objective(env: str, ridge: float) -> Non
     samples = uniform_samples(spec)
     fitted = fit_offline(spec, samples.states, samples.accelerations, ridge=ridge)
     theta, prior = fitted.parameters, initial_weights(spec)
-    J = torch_jacobian(spec, theta, samples.states)
+    J = complex_jacobian(spec, theta, samples.states).reshape(-1, len(theta))
     e = (samples.accelerations - spec.model.predict(spec.system, theta, samples.states)).ravel()
     slope = J.T @ e + ridge * (prior - theta)
     value = e @ e + ridge * np.sum((theta - prior) ** 2)
@@ -117,9 +107,8 @@ def test_each_network_of_an_ensemble_is_fitted_by_itself() -> None:
     for member, start in zip(others, drawn[1:], strict=True):
         assert not np.allclose(member, first)
         e = samples.accelerations - spec.model.predict(spec.system, member, samples.states)
-        slope = torch_jacobian(spec, member, samples.states).T @ e.ravel() + RIDGE * (
-            start - member
-        )
+        J = complex_jacobian(spec, member, samples.states).reshape(-1, len(member))
+        slope = J.T @ e.ravel() + RIDGE * (start - member)
         assert np.linalg.norm(slope) < 1e-2 * np.linalg.norm(start - member)
 
 
@@ -130,6 +119,40 @@ def test_a_fit_of_a_linear_model_is_the_ridge_solution_and_recovers_the_physics(
     truth = [getattr(spec.system, name) for name in spec.system.linear_parameters]
     np.testing.assert_allclose(fitted.parameters, np.array(truth), rtol=0.0, atol=1e-2)
     assert fitted.loss < 1e-2
+
+
+@pytest.mark.parametrize("env", ["pendulum", "quadrotor", "drifting_pendulum"])
+def test_recorded_samples_are_what_the_learner_was_given(env: str) -> None:
+    spec = small(env)
+    running = KernelTrial(spec)
+    running.advance(spec.system.horizon)
+    samples = recorded_samples(spec.system, running.record.states, running.record.inputs)
+    given = observed(running, running.done)
+    np.testing.assert_allclose(samples.accelerations, given, rtol=5e-10, atol=5e-10)
+    assert np.array_equal(samples.states, rerun(spec, [spec.system.horizon]).states[:-1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"ridge": 0}, "ridge is 0, but a number above 0 is expected"),
+        ({"ridge": float("nan")}, "ridge is nan"),
+        ({"max_steps": 0}, "max_steps is 0, but at least 1"),
+        ({"states": np.zeros((60, 1))}, r"states have the shape \(60, 1\)"),
+        ({"accelerations": np.zeros((59, 1))}, "60 states and 59 accel"),
+        ({"states": np.full((60, 2), np.nan)}, "states hold a number that is not finite"),
+    ],
+)
+def test_bad_input_gets_a_sentence(changes: dict[str, Any], words: str) -> None:
+    good = {"states": np.zeros((60, 2)), "accelerations": np.zeros((60, 1))}
+    with pytest.raises(SpecificationError, match=words):
+        fit_offline(small("pendulum"), **(good | changes))
+
+
+def test_a_model_without_an_offline_fit_is_refused() -> None:
+    grey = trial("pendulum", "random", 1, model={"name": "grey_box"}, learner={"name": "ekf"})
+    with pytest.raises(SpecificationError, match=r"model 'grey_box' has no offline fit, but 'mlp'"):
+        fit_offline(grey, np.zeros((60, 2)), np.zeros((60, 1)))
 
 
 def test_fixed_parameters_of_a_linear_model_stay() -> None:
@@ -143,96 +166,15 @@ def test_fixed_parameters_of_a_linear_model_stay() -> None:
     assert fitted.loss < 0.2 * grid_loss(spec, initial_weights(spec))
 
 
-def test_few_steps_are_said_not_to_have_converged() -> None:
-    spec = small("pendulum")
-    samples = uniform_samples(spec)
-    fitted = fit_offline(spec, samples.states, samples.accelerations, max_steps=3)
-    assert (fitted.steps, fitted.converged) == (3, False)
-
-
-def test_the_loss_is_that_of_a_trial_after_its_last_step() -> None:
-    for env in ("pendulum", "drifting_pendulum"):
-        spec = small(env)
-        result = dopt.run_trial(spec)
-        np.testing.assert_allclose(grid_loss(spec, result.parameters), result.final_loss, rtol=1e-5)
-
-
-@pytest.mark.parametrize("env", ["pendulum", "quadrotor", "drifting_pendulum"])
-def test_recorded_samples_are_what_the_learner_was_given(env: str) -> None:
-    from dopt.kernel.run import KernelTrial
-
-    spec = small(env)
-    running = KernelTrial(spec)
-    running.advance(spec.system.horizon)
-    samples = recorded_samples(spec.system, running.record.states, running.record.inputs)
-    given = observed(running, running.done)
-    np.testing.assert_allclose(samples.accelerations, given, rtol=5e-10, atol=5e-10)
-    assert np.array_equal(samples.states, rerun(spec, [spec.system.horizon]).states[:-1])
-
-
-def test_uniform_samples_fill_the_box_with_the_noise_of_the_trial() -> None:
-    spec = small("cartpole", 400)
-    system, samples = spec.system, uniform_samples(spec)
-    for index, (low, high) in system.grid_box().items():
-        column = samples.states[:, index]
-        assert low <= column.min() < low + 0.05 * (high - low)
-        assert high - 0.05 * (high - low) < column.max() <= high
-    others = [i for i in range(system.n_states) if i not in system.grid_box()]
-    assert not samples.states[:, others].any()
-    noise = draw(spec).noise[:, list(system.learned_rows)] / system.dt
-    np.testing.assert_allclose(
-        samples.accelerations - system.learned(samples.states), noise, rtol=0.0, atol=1e-12
-    )
-    other = uniform_samples(trial("cartpole", "uniform", 2, env={"horizon": 400}, model=SMALL))
-    assert np.array_equal(samples.states, other.states)
-
-
-def refused(words: str, spec: TrialSpec, samples: Samples, **settings: float) -> None:
-    with pytest.raises(SpecificationError, match=words):
-        fit_offline(spec, samples.states, samples.accelerations, **settings)  # type: ignore[arg-type]
-
-
-def test_bad_input_gets_a_sentence() -> None:
-    spec = small("pendulum")
-    good = uniform_samples(spec)
-    refused(r"ridge is 0, but a number above 0 is expected", spec, good, ridge=0)
-    refused(r"ridge is nan", spec, good, ridge=float("nan"))
-    refused(r"max_steps is 0, but at least 1", spec, good, max_steps=0)
-    refused(r"states have the shape \(60, 1\)", spec, replace(good, states=good.states[:, :1]))
-    refused(r"60 states and 59 accel", spec, replace(good, accelerations=good.accelerations[1:]))
-    lost = good.states.copy()
-    lost[7] = np.nan
-    refused(r"states hold a number that is not finite", spec, replace(good, states=lost))
-    grey = trial("pendulum", "random", 1, model={"name": "grey_box"}, learner={"name": "ekf"})
-    refused(r"model 'grey_box' has no offline fit, but 'mlp'", grey, good)
-
-
 def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:
     pytest.importorskip("gymnasium")
-    spec = TrialSpec.from_mapping(
-        {
-            "env": {"_target_": "tests.dopt.custom_environments.Point", "horizon": 40},
-            "policy": {"name": "random"},
-            "model": {"name": "mlp"},
-            "learner": {"name": "adam_window"},
-        }
-    )
-    samples = uniform_samples(spec)
+    env = {"_target_": "tests.dopt.custom_environments.Point", "horizon": 40}
+    spec = TrialSpec.from_names(env, "random")
+    system: Any = spec.system
+    samples = Samples(*random_transitions(system, 40, np.random.default_rng(0)))
     assert len(samples.states) == 40
     fitted = fit_offline(spec, samples.states, samples.accelerations)
     assert fitted.loss < grid_loss(spec, initial_weights(spec))
-
-
-def limited(
-    limits: dict[str, Any] | None, policy: str = "d_optimal", /, *, horizon: int = 20,
-    seed: int = 0, learner: str = "joint_ekf", **env: Any,
-) -> TrialSpec:  # fmt: skip
-    """Return a trial of the cartpole of which angle and place are measured."""
-    spec = sensed(
-        "cartpole", CART | env, learner, policy, horizon=horizon, seed=seed,
-        **({"refit_every": 1000} if learner == "joint_ekf" else {}),
-    )  # fmt: skip
-    return TrialSpec.from_mapping(spec.to_mapping() | {"limits": limits})
 
 
 def test_variances_are_those_of_state_and_parameters_in_one_filter() -> None:
@@ -240,27 +182,8 @@ def test_variances_are_those_of_state_and_parameters_in_one_filter() -> None:
     fast = KernelTrial(sensed("pendulum", sensors, horizon=13, refit_every=1000))
     fast.advance(12)
     expected = filtered(fast.spec, fast.state.estimate.outputs[:12], fast.record.inputs[:12])[2]
-    found = call(joint_kalman.state_variances, fast.trial, 12)
+    found = interpreted(joint_kalman.state_variances)(fast.trial, 12)
     np.testing.assert_allclose(found, expected[:2], rtol=1e-3)
-
-
-def beyond(result: TrialResult) -> float:
-    """Return the share of the steps after which the true cart is beyond its rail."""
-    return float(np.mean(np.abs(result.states[1:, 0]) > 2.0))
-
-
-def test_the_true_cart_stays_on_its_rail() -> None:
-    """Counted on the true states: without limits it leaves the rail, without a margin also."""
-    free, bare = (
-        run_trial(limited(RAIL | given, horizon=300))
-        for given in ({"enforced": False}, {"margin": 0.0})
-    )
-    kept = [run_trial(limited(RAIL, horizon=300, seed=seed)) for seed in range(2)]
-    assert beyond(free) > 0.5
-    assert sum(map(beyond, kept)) <= 0.01 * 2
-    assert beyond(kept[0]) < beyond(bare)
-    for result in (free, bare, *kept):
-        assert measures(result)["violations"] == pytest.approx(300 * beyond(result))
 
 
 def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
@@ -286,11 +209,10 @@ def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None
 
 def test_limits_of_filtered_differences_are_refused() -> None:
     """Nothing says how uncertain these are; limits that are counted alone need no such thing."""
-    with pytest.raises(
-        IncompatibleError, match="which knows how uncertain its estimates are, but l"
-    ):
-        limited(RAIL, learner="adam_window")
-    limited(RAIL | {"enforced": False}, learner="adam_window")
+    mapping = sensed("cartpole", CART, "adam_window").to_mapping()
+    TrialSpec.from_mapping(mapping | {"limits": RAIL | {"enforced": False}})
+    with pytest.raises(IncompatibleError, match="which knows how uncertain its estimates are"):
+        TrialSpec.from_mapping(mapping | {"limits": RAIL})
 
 
 def test_the_loss_of_coupled_pendulums_is_their_parameter_error_times_a_constant() -> None:
@@ -318,84 +240,93 @@ def test_systems_whose_loss_is_no_parameter_error_are_refused() -> None:
     uneven = CoupledPendulums(n_pendulums=2, grid_half_widths=(1.0, 1.1))
     with pytest.raises(SpecificationError, match=r"dopt\.run"):
         loss_by_parameter_error(uneven)
+    object.__setattr__(uneven, "linear_parameters", ())
+    with pytest.raises(SpecificationError, match="no parameters that its accelerations are linear"):
+        true_parameters(uneven)
     even = dataclasses.replace(uneven, grid_half_widths=(1.0,))
     assert loss_by_parameter_error(even) == pytest.approx(1 / 3**0.5, rel=1e-3)
 
 
-def test_a_system_without_linear_parameters_is_refused() -> None:
-    class Nothing(CoupledPendulums):
-        pass
+class Innovations(NamedTuple):
+    """What the filter of the state leaves at some parameters, step by step."""
 
-    system = Nothing()
-    object.__setattr__(system, "linear_parameters", ())
-    with pytest.raises(SpecificationError, match="no parameters that its accelerations are linear"):
-        true_parameters(system)
+    gains: list[Array]  # K, (d,)
+    errors: Array  # e, (n,)
+    variances: Array  # s, (n,)
 
-
-def finished(spec: TrialSpec) -> KernelTrial:
-    fast = KernelTrial(spec)
-    fast.advance(spec.system.horizon)
-    return fast
+    @property
+    def unlikelihood(self) -> float:
+        """Return Σ (e²/s + log s)."""
+        return float(np.sum(self.errors**2 / self.variances + np.log(self.variances)))
 
 
-def objective(fast: KernelTrial) -> float:
-    """Return Σ (e²/s + log s) + λ‖θ - θ₀‖² at the present parameters, λ being the policy's."""
-    theta, prior, n = fast.state.theta, fast.state.prior, fast.done
-    total = call(run_filter, fast.trial, n, np.empty((0, len(theta))), np.empty(0))
-    return float(total + 3.0 * np.sum((theta - prior) ** 2))
-
-
-def test_a_fit_finds_parameters_at_which_all_that_was_measured_is_likelier() -> None:
-    objectives = {}
-    for steps in (1, 8):
-        fast = finished(sensed("pendulum", ANGLE, horizon=60, refit_every=60, steps=steps))
-        objectives[steps] = objective(fast)
-        if steps == 1:
-            fast.state.theta[:] = draw(fast.spec).weights
-            objectives[0] = objective(fast)
-    assert objectives[8] <= objectives[1] < objectives[0]
-
-
-def test_rows_of_a_fit_are_derivatives_of_the_innovations() -> None:
-    """With the gains held, as in the step of Gauss and Newton."""
-    fast = finished(sensed("pendulum", ANGLE, horizon=20, refit_every=1000))
-    theta = fast.state.theta.copy()
-    rows, found = np.empty((20, len(theta))), np.empty(20)
-    call(run_filter, fast.trial, 20, rows, found)
-    gains = _gains(fast, theta)
-    scale = np.array([s for _, s in gains]) ** -0.5
-    assert np.allclose(found, _errors(fast, theta, gains) * scale, rtol=1e-6, atol=1e-8)
-    direction = np.random.default_rng(1).standard_normal(len(theta))
-    ahead, behind = (_errors(fast, theta + sign * 1e-5 * direction, gains) for sign in (1.0, -1.0))
-    expected = -(ahead - behind) / 2e-5 * scale
-    np.testing.assert_allclose(rows @ direction, expected, rtol=1e-4, atol=1e-6)
-
-
-def _gains(fast: KernelTrial, theta: Array) -> list[tuple[Array, float]]:
-    """Return the gain and the variance of each step of the filter at some parameters."""
-    spec, x, P, found = fast.spec, fast.record.states[0], np.zeros((2, 2)), []
+def innovations(
+    fast: KernelTrial, theta: Array, rho: float = 0.1, gains: list[Array] | None = None
+) -> Innovations:
+    """Filter the angle of a pendulum at parameters and a noise; gains that are given are held."""
+    spec, x, P = fast.spec, fast.record.states[0], np.zeros((2, 2))
+    kept, errors, variances = [], [], []
     for t, u in enumerate(fast.record.inputs):
         step = 1e-6 * np.eye(2)
         ends = [[model_step(spec, theta, x + sign * e, u) for e in step] for sign in (1, -1)]
         A = (np.array(ends[0]) - np.array(ends[1])).T / 2e-6
+        P = A @ P @ A.T + np.diag([0.0, spec.system.dt**2 * rho])
+        variances.append(P[0, 0] + DEGREE**2)
+        K = P[:, 0] / variances[-1]
+        P = P - np.outer(K, K) * variances[-1]
+        kept.append(K if gains is None else gains[t])
         x = model_step(spec, theta, x, u)
-        P = A @ P @ A.T + np.diag([0.0, spec.system.dt**2 * 0.1])
-        variance = P[0, 0] + DEGREE**2
-        K = P[:, 0] / variance
-        found.append((K, variance))
-        P = P - np.outer(K, K) * variance
-        x = x + K * (fast.state.estimate.outputs[t, 0] - x[0])
-    return found
+        errors.append(fast.state.estimate.outputs[t, 0] - x[0])
+        x = x + kept[-1] * errors[-1]
+    return Innovations(kept, np.array(errors), np.array(variances))
 
 
-def _errors(fast: KernelTrial, theta: Array, gains: list[tuple[Array, float]]) -> Array:
-    x, errors = fast.record.states[0], []
-    for t, (K, _) in enumerate(gains):
-        x = model_step(fast.spec, theta, x, fast.record.inputs[t])
-        error = fast.state.estimate.outputs[t, 0] - x[0]
-        errors.append(error)
-        x = x + K * error
-    return np.array(errors)
+def after_fit(horizon: int = 20, **learner: Any) -> KernelTrial:
+    """Return a trial of a small network that ends with a fit of all that was measured."""
+    spec = sensed("pendulum", ANGLE, horizon=horizon, refit_every=horizon, **learner)
+    small = {"model": {"name": "mlp", "width": 4}}
+    fast = KernelTrial(TrialSpec.from_mapping(spec.to_mapping() | small))
+    fast.advance(horizon)
+    return fast
+
+
+def objective(fast: KernelTrial, theta: Array) -> float:
+    """Return Σ (e²/s + log s) + λ‖θ - θ₀‖², λ being the policy's."""
+    prior = draw(fast.spec).weights
+    return innovations(fast, theta).unlikelihood + 3.0 * float(np.sum((theta - prior) ** 2))
+
+
+def test_a_fit_finds_parameters_at_which_all_that_was_measured_is_likelier() -> None:
+    one, eight = (after_fit(60, steps=steps) for steps in (1, 8))
+    found = [objective(fast, fast.state.theta.copy()) for fast in (one, eight)]
+    assert found[1] <= found[0] < objective(one, draw(one.spec).weights)
+
+
+def test_the_information_after_a_fit_is_in_the_derivatives_of_the_innovations() -> None:
+    """With the gains held, as in the step of Gauss and Newton: M = λI + Σ ∂e/∂θᵀ ∂e/∂θ / s."""
+    fast = after_fit()
+    theta = fast.state.theta.copy()
+    held = innovations(fast, theta)
+    ends = [
+        [innovations(fast, theta + sign * e, gains=held.gains).errors for sign in (1, -1)]
+        for e in 1e-5 * np.eye(len(theta))
+    ]
+    rows = np.array([(ahead - behind) / 2e-5 for ahead, behind in ends]) / held.variances**0.5
+    expected = 3.0 * np.eye(len(theta)) + rows @ rows.T
+    np.testing.assert_allclose(
+        dense(fast.state.covariance) @ expected, np.eye(len(theta)), atol=1e-4
+    )
+
+
+def test_a_fitted_noise_is_the_likeliest_of_its_neighbours() -> None:
+    fast = after_fit(60, noise="fitted", noise_variance=3.0)
+    fitted, theta = float(fast.state.estimate.noise_variance[0]), fast.state.theta.copy()
+    moves = abs(math.log10(fitted / 3.0)) / math.log10(NOISE_FACTORS[0])
+    assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
+    lowest, *others = (
+        innovations(fast, theta, factor * fitted).unlikelihood for factor in (1.0, *NOISE_FACTORS)
+    )
+    assert lowest <= min(others)
 
 
 LINEAR: dict[str, Any] = {
@@ -436,14 +367,11 @@ def test_the_log_loss_of_a_linear_model_is_lowest_with_the_covariance_of_the_noi
     assert sum(found[1.0]) < min(sum(found[0.2]), sum(found[5.0]))
 
 
-def test_jacobians_are_those_of_automatic_differentiation() -> None:
-    spec = trial("cartpole", "random")
-    theta = run_trial(spec).parameters.astype(float)
-    found = jacobian(spec, theta, evaluated(spec))
-    states = torch.as_tensor(evaluation_set(spec.system).states)[None]
-    function = mlp_function(spec.system, spec.model)
-    expected = torch.func.jacrev(lambda one: function(one[None], states)[0])(torch.as_tensor(theta))
-    assert found == pytest.approx(expected.numpy(), rel=1e-6, abs=1e-8)
+def test_jacobians_are_those_of_complex_steps() -> None:
+    spec = trial("cartpole", "random", model={"width": 4})
+    theta, at = initial_weights(spec), evaluated(spec)
+    expected = complex_jacobian(spec, theta, at.states)
+    assert jacobian(spec, theta, at) == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
 def test_r_squared_is_one_for_the_truth_and_falls_with_the_error() -> None:

@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scipy import stats
 
 from dopt.assessment import model_forecast, true_forecast
 from dopt.control.planning import forecast_by, forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, simulate
-from dopt.kernel.run import KernelTrial
 from dopt.models import MLP, RFF, Ensemble, Linear
 from dopt.models.base import Model
 from dopt.randomness import _STREAMS, draw, stream
@@ -26,7 +24,6 @@ from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, DriftingPendulum, Pendulum
 from dopt.systems.base import INTEGRATORS, System
-from tests.dopt.custom_networks import model_of_one
 from tests.dopt.trials import KNOWN_EFFECT, MODELS, PAIRS, covering, trial
 
 DRIFT = {"final_friction": 2.0, "time_constant": 0.3, "friction": 0.1}
@@ -93,14 +90,6 @@ def test_without_a_drift_it_is_the_pendulum() -> None:
     assert two.loss == pytest.approx(one.loss, rel=1e-6)
 
 
-def test_trials_that_share_a_config_do_not_share_the_truth() -> None:
-    spec = trial("drifting_pendulum", "random", env=DRIFT)
-    first, second = KernelTrial(spec), KernelTrial(spec)
-    first.advance(30)
-    second.advance(30)
-    assert np.array_equal(first.record.loss, second.record.loss)
-
-
 def test_forgetting_follows_a_drift_that_memory_averages() -> None:
     """Paired over seeds: the loss in the second half of the trial, against the truth of then."""
 
@@ -126,7 +115,6 @@ def test_forgetting_follows_a_drift_that_memory_averages() -> None:
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us", "states", "inputs")
 POLICIES = ["random", "uniform", "d_optimal", "oracle"]
 DAMPING = {"cartpole": "pivot_friction", "mass_spring": "damping"}
-ABSURD = {"learning_rate": 1e300}
 
 
 def leaving(policy: str, seed: int = 0) -> TrialSpec:
@@ -166,21 +154,15 @@ def test_a_state_beyond_the_limit_ends_a_trial(policy: str) -> None:
     assert fast.parameters == pytest.approx(plain.parameters, rel=1e-7, abs=1e-10)
 
 
+@pytest.mark.parametrize("rate", [1e3, 1e30, 1e154, 1e300])
 @pytest.mark.parametrize("policy", ["random", "uniform", "d_optimal"])
-def test_an_absurd_learning_rate_ends_a_trial(policy: str) -> None:
-    spec = trial("pendulum", policy, learner=ABSURD)
-    end = check_rows(run_trial(spec, "kernel"))
-    assert check_rows(run_trial(spec, "reference")) == end
-
-
-@pytest.mark.parametrize("rate", [1e3, 1e30, 1e154])
-@pytest.mark.parametrize("policy", ["uniform", "d_optimal"])
 def test_any_learning_rate_gives_a_result(policy: str, rate: float) -> None:
     """The trial ends, or goes on with poor numbers: it never raises."""
     for env in ("pendulum", "arm"):
         spec = trial(env, policy, env={"horizon": 8}, learner={"learning_rate": rate})
         fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
         assert fast.diverged_at == plain.diverged_at
+        assert fast.diverged or rate < 1e300
         for result in (fast, plain):
             if result.diverged:
                 check_rows(result)
@@ -218,16 +200,12 @@ def test_a_state_beyond_the_limit_from_the_start_leaves_no_row() -> None:
 
 def test_the_properties_of_a_whole_trial() -> None:
     result = run_trial(trial("pendulum", "random"))
-    assert not result.diverged
-    assert result.diverged_at is None
-    assert result.n_steps == 30
+    assert (result.diverged, result.diverged_at, result.n_steps) == (False, None, 30)
     assert result.final_loss == result.loss[-1]
     assert result.best_loss == result.loss.min()
-    assert result.states.shape == (31, 2)
-    assert result.inputs.shape == (30, 1)
+    assert (result.states.shape, result.inputs.shape) == ((31, 2), (30, 1))
     assert len(result.parameters) == 64 + 272 + 17
-    assert result.wall_seconds > 0.0
-    assert result.cpu_seconds >= 0.0
+    assert result.wall_seconds > 0.0 <= result.cpu_seconds
 
 
 def specification(env: str = "pendulum", policy: str = "d_optimal", **model: object) -> TrialSpec:
@@ -243,12 +221,6 @@ def test_looking_on_the_way_changes_nothing(policy: str) -> None:
     assert seen.steps.tolist() == [0, 7, 8, 40]
 
 
-def test_the_first_look_is_at_the_initial_parameters() -> None:
-    shorter = rerun(specification(), [0])
-    assert np.abs(shorter.parameters[0]).max() <= 1.0
-    assert rerun(specification(), []).parameters.shape == (0, 353)
-
-
 def test_a_trial_that_diverges_is_seen_until_then() -> None:
     for path in ("kernel", "reference"):
         mapping = {**specification(policy="random").to_mapping(), "path": path}
@@ -261,32 +233,13 @@ def test_a_trial_that_diverges_is_seen_until_then() -> None:
         np.testing.assert_array_equal(seen.states, whole.states)
 
 
-def test_steps_begin_with_the_first() -> None:
-    with pytest.raises(SpecificationError, match="step -3 was asked for, but the first is 0"):
-        rerun(specification(), [-3, 10])
+def test_steps_ascend_from_the_first() -> None:
+    assert rerun(specification(), []).parameters.shape == (0, 353)
+    for steps, words in (([5, 5], "do not ascend"), ([-3, 10], "-3 was asked .* the first is 0")):
+        with pytest.raises(SpecificationError, match=words):
+            rerun(specification(), steps)
 
 
-def test_steps_must_ascend() -> None:
-    with pytest.raises(SpecificationError, match="do not ascend"):
-        rerun(specification(), [5, 5])
-
-
-@pytest.mark.parametrize("env", KNOWN_EFFECT)
-@pytest.mark.parametrize("model", [{"depth": 1, "width": 5}, {"depth": 3, "width": 4}, None])
-def test_prediction_is_that_of_the_reference(env: str, model: dict[str, object] | None) -> None:
-    spec = specification(env) if model is None else specification(env, **model)
-    if model is None:
-        spec = specification(env, policy="oracle")
-    rng = np.random.default_rng(1)
-    theta = rng.normal(size=spec.model.n_parameters(spec.system))
-    states = rng.normal(size=(6, spec.system.n_states))
-    reference = model_of_one(spec.system, spec.model)
-    expected = [reference(torch.tensor(theta), torch.tensor(x)).numpy() for x in states]
-    predicted = spec.model.predict(spec.system, theta, states)
-    np.testing.assert_allclose(predicted, expected, rtol=1e-10, atol=1e-12)
-
-
-NAMES = ("noise", "weights", "inputs", "components", "ties")
 STREAMS = tuple(_STREAMS)
 
 
@@ -303,27 +256,17 @@ def test_policies_that_are_compared_share_noise_and_initial_weights(env: str) ->
         assert np.array_equal(first.noise, draw(trial(env, policy, 11)).noise)
 
 
-@pytest.mark.parametrize("env", SYSTEMS)
-def test_another_seed_moves_every_draw(env: str) -> None:
-    one, two = draw(trial(env, "random", 0)), draw(trial(env, "random", 1))
-    assert not np.any(one.noise == two.noise)
-    assert not np.any(one.weights == two.weights)
-    assert not np.any(one.inputs == two.inputs)
-
-
-def test_a_longer_trial_begins_with_the_same_noise() -> None:
-    short = draw(trial("arm", "d_optimal", 3))
+def test_draws_that_longer_trials_and_wider_networks_leave_alone() -> None:
+    first, other = (draw(trial("arm", "d_optimal", seed)) for seed in (3, 4))
     long = draw(trial("arm", "d_optimal", 3, env={"horizon": 70}))
-    assert np.array_equal(short.noise, long.noise[:30])
-    assert np.array_equal(short.weights, long.weights)
-
-
-def test_a_wider_network_leaves_noise_inputs_and_components_alone() -> None:
-    narrow = draw(trial("arm", "d_optimal", 3))
+    assert np.array_equal(first.noise, long.noise[:30])
+    assert np.array_equal(first.weights, long.weights)
     wide = draw(trial("arm", "d_optimal", 3, model={"width": 32, "depth": 3}))
-    assert len(wide.weights) > len(narrow.weights)
+    assert len(wide.weights) > len(first.weights)
     for name in ("noise", "inputs", "components", "ties"):
-        assert np.array_equal(getattr(narrow, name), getattr(wide, name)), name
+        assert np.array_equal(getattr(first, name), getattr(wide, name)), name
+    for name in ("noise", "weights", "inputs"):
+        assert not np.any(getattr(first, name) == getattr(other, name)), name
 
 
 def test_streams_are_not_correlated() -> None:
@@ -334,17 +277,20 @@ def test_streams_are_not_correlated() -> None:
     assert np.abs(correlations).max() < 0.05
 
 
+def test_components_and_ties_have_no_preference() -> None:
+    """A component is one of the learned ones, a tie a unit vector."""
+    drawn = draw(trial("arm", "d_optimal", env={"horizon": 10_000}))
+    assert set(drawn.components.tolist()) == {0, 1}
+    assert drawn.components.mean() == pytest.approx(0.5, abs=0.03)
+    assert np.linalg.norm(drawn.ties, axis=1) == pytest.approx(1.0)
+    assert np.abs(drawn.ties.mean(axis=0)).max() < 0.05
+
+
 def test_the_noise_has_variance_dt_sigma_squared() -> None:
     spec = trial("quadrotor", "random", env={"horizon": 20_000, "dt": 0.04, "noise": 0.3})
     noise = draw(spec).noise
     assert noise.var(axis=0) == pytest.approx(0.04 * 0.3**2, rel=0.05)
     assert noise.mean(axis=0) == pytest.approx(0.0, abs=5 * 0.3 * 0.2 / np.sqrt(20_000))
-
-
-def test_components_are_drawn_evenly_among_the_learned_ones() -> None:
-    components = draw(trial("arm", "d_optimal", env={"horizon": 10_000})).components
-    assert set(components.tolist()) == {0, 1}
-    assert components.mean() == pytest.approx(0.5, abs=0.03)
 
 
 def test_weights_are_uniform_within_one_over_root_fan_in() -> None:
@@ -354,12 +300,6 @@ def test_weights_are_uniform_within_one_over_root_fan_in() -> None:
         bound = 1 / np.sqrt(fan_in)
         assert 0.9 * bound < np.abs(layer).max() <= bound
     assert weights[1].std() == pytest.approx(1 / np.sqrt(3 * 64), rel=0.05)
-
-
-def test_ties_are_unit_vectors_in_all_directions() -> None:
-    ties = draw(trial("arm", "d_optimal", env={"horizon": 5_000})).ties
-    assert np.linalg.norm(ties, axis=1) == pytest.approx(1.0)
-    assert np.abs(ties.mean(axis=0)).max() < 0.05
 
 
 STATES, STEPS = 7, 12
@@ -379,13 +319,6 @@ def asked(system: System) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))
-def test_the_truth_is_that_of_the_first_step(name: str) -> None:
-    system = SYSTEMS[name]()
-    expected = forecast_by_equations(system)(*asked(system))
-    np.testing.assert_allclose(true_forecast(system)(*asked(system)), expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", sorted(SYSTEMS))
 def test_every_model_is_rolled_as_its_predictions_say(name: str) -> None:
     system = SYSTEMS[name]()
     for model in FORECAST:
@@ -402,24 +335,18 @@ def predict(model: Model, system: System, theta: np.ndarray, x: np.ndarray, u: n
     return model.predict(system, theta, x, u)
 
 
-@pytest.mark.parametrize("name", [one for one in sorted(SYSTEMS) if one not in CHANGING])
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
 def test_forecasts_are_the_simulation_of_the_evaluation(name: str) -> None:
-    for integrator in INTEGRATORS:
+    system = SYSTEMS[name]()
+    at_first = forecast_by_equations(system)(*asked(system))
+    np.testing.assert_allclose(true_forecast(system)(*asked(system)), at_first, rtol=1e-12)
+    for integrator in INTEGRATORS if name not in CHANGING else ():
         system = SYSTEMS[name](integrator=integrator)
         _, inputs = asked(system)
         starts = np.tile(system.initial_state, (STATES, 1))
         expected = simulate(system, inputs.swapaxes(0, 1))[1:]
         found = true_forecast(system)(starts, inputs)
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
-
-
-def test_the_parameters_of_the_moment_are_kept() -> None:
-    pendulum, model = Pendulum(), MLP()
-    parameters = model.initial_parameters(pendulum, np.random.default_rng(0))
-    forecast = model_forecast(pendulum, model, parameters)
-    before = forecast(*asked(pendulum))
-    parameters[:] = 0.0
-    np.testing.assert_array_equal(forecast(*asked(pendulum)), before)
 
 
 def test_numbers_that_overflow_are_not_finite() -> None:

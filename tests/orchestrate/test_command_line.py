@@ -20,14 +20,14 @@ from analysis.cli import parser as parser_of_analysis
 from dopt.errors import _say_once
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from orchestrate.__main__ import COMMANDS
 from orchestrate.__main__ import main as orchestrate
-from orchestrate.commands import COMMANDS
 from orchestrate.program import SUCCESSORS
 from orchestrate.runner import start
 from orchestrate.runner.start import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
 from orchestrate.store.backends.base import parse_url
-from orchestrate.store.backends.sqlite_engine import existing_path
+from orchestrate.store.backends.sqlite import existing_path
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.pages import commands
 from tests.paths import ROOT

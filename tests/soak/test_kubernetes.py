@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -167,7 +167,7 @@ pytestmark = [pytest.mark.soak, pytest.mark.timeout(1800)]
 
 
 def test_evicted_pods_lose_nothing_and_compute_little_twice(
-    request: pytest.FixtureRequest, postgresql_url: str, tmp_path: Path
+    postgresql_url: str, tmp_path: Path, tell: Callable[[str], None]
 ) -> None:
     trials, chance = int(os.environ.get("DOPT_EVICTION_TRIALS", TRIALS)), random.Random(3)
     grid = ("env=pendulum", "policy=d_optimal", f"seed=range({trials})")
@@ -191,9 +191,8 @@ def test_evicted_pods_lose_nothing_and_compute_little_twice(
     finally:
         job.close()
     statuses, attempts, in_vain = outcomes(postgresql_url)
-    terminal = request.config.get_terminal_writer()
-    terminal.line(
-        f"\n{trials:,} trials, {evictions} evictions, pods ended with {dict(job.ended)}, "
+    tell(
+        f"{trials:,} trials, {evictions} evictions, pods ended with {dict(job.ended)}, "
         f"attempts {attempts}, at most {in_vain} of them begun in vain"
     )
     assert evictions >= trials / 200

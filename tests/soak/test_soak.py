@@ -40,11 +40,6 @@ FEWEST_FAULTS = 10
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1800)]
 
 
-@pytest.fixture
-def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    return lambda text: request.config.get_terminal_writer().line(f"\n{text}")
-
-
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
 def test_a_grid_survives_everything(
     request: pytest.FixtureRequest,

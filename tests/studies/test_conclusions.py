@@ -17,7 +17,7 @@ from studies.conclusions import filter as joint_filter
 from studies.conclusions import network, tables, trials
 from studies.conclusions.__main__ import PARTS, complete, main
 from studies.conclusions.trials import Cell, Row
-from tests.dopt.oracles.test_joint_kalman import filtered
+from tests.dopt.oracles.test_oracles import filtered
 from tests.dopt.trials import trial
 from tests.pages import DOCS
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -44,21 +46,13 @@ DISKS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def disks(tmp_path_factory: pytest.TempPathFactory) -> str:
-    address = f"sqlite:///{tmp_path_factory.mktemp('disk')}/results.db"
-    fill(address, DISKS, edit=simulated)
-    return address
-
-
 def named(spec: TrialSpec) -> tuple[bool, str, int]:
     policy = getattr(spec.policy, "criterion", spec.policy.name)
     return spec.limits.enforced, policy, spec.seed  # type: ignore[union-attr]
 
 
-def test_rows_follow_from_the_trials(disks: str, tmp_path: Path) -> None:
-    assert main(["--db", disks, "--out", str(tmp_path)]) == 0
-    rows = pd.read_csv(tmp_path / "active_sysid_trials.csv")
+def test_rows_follow_from_the_trials(made: Made) -> None:
+    rows = made.read("active_sysid_trials")
     table = rows.set_index(["enforced", "policy", "seed"]).sort_index()
     assert len(table) == len(DISKS)
     for spec in DISKS:
@@ -84,15 +78,11 @@ def test_the_true_model_is_left_with_the_noise_and_none_with_the_motion() -> Non
     assert TEST_SAMPLES == 2000
 
 
-def test_medians_counts_and_ratios_of_disks_follow_from_the_trials(
-    disks: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["--db", disks, "--out", str(tmp_path)])
-    shown = capsys.readouterr().out
-    assert "published: idw" in shown
-    assert "| rate within 4.5 rad/s" in shown
-    trials = pd.read_csv(tmp_path / "active_sysid_trials.csv")
-    table = pd.read_csv(tmp_path / "active_sysid.csv").set_index(["enforced", "policy"])
+def test_medians_counts_and_ratios_of_disks_follow_from_the_trials(made: Made) -> None:
+    assert "published: idw" in made.shown
+    assert "| rate within 4.5 rad/s" in made.shown
+    trials = made.read("active_sysid_trials")
+    table = made.read("active_sysid").set_index(["enforced", "policy"])
     by_seed = trials.pivot_table(index="seed", columns=["enforced", "policy"], values="error")
     assert table["median"].to_numpy() == pytest.approx(by_seed.median()[table.index].to_numpy())
     assert (table.reached == (by_seed <= 0.83).sum()[table.index]).all()
@@ -144,16 +134,8 @@ SPECS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def chains(tmp_path_factory: pytest.TempPathFactory) -> str:
-    address = f"sqlite:///{tmp_path_factory.mktemp('pendulums')}/results.db"
-    fill(address, SPECS, edit=simulated)
-    return address
-
-
-def test_samples_are_those_after_which_the_error_stays_small(chains: str, tmp_path: Path) -> None:
-    assert main(["--db", chains, "--out", str(tmp_path)]) == 0
-    table = pd.read_csv(tmp_path / "flex_table3_trials.csv")
+def test_samples_are_those_after_which_the_error_stays_small(made: Made) -> None:
+    table = made.read("flex_table3_trials")
     assert len(table) == len(SPECS)
     for spec in SPECS:
         mask = (table.policy == spec.policy.name) & (table.seed == spec.seed)
@@ -165,10 +147,9 @@ def test_samples_are_those_after_which_the_error_stays_small(chains: str, tmp_pa
         assert row["final_error"] == pytest.approx(errors[-1], rel=1e-6)
 
 
-def test_medians_and_ratios_follow_from_the_trials(chains: str, tmp_path: Path) -> None:
-    main(["--db", chains, "--out", str(tmp_path)])
-    trials = pd.read_csv(tmp_path / "flex_table3_trials.csv")
-    for row in pd.read_csv(tmp_path / "flex_table3.csv").to_dict("records"):
+def test_medians_and_ratios_follow_from_the_trials(made: Made) -> None:
+    trials = made.read("flex_table3_trials")
+    for row in made.read("flex_table3").to_dict("records"):
         of_size = trials[trials.n_pendulums == row["n_pendulums"]].pivot_table(
             index="seed", columns="policy", values="samples"
         )
@@ -176,15 +157,7 @@ def test_medians_and_ratios_follow_from_the_trials(chains: str, tmp_path: Path) 
         if row["policy"] != "random":
             logs = np.log(of_size[row["policy"]] / of_size["random"])
             assert row["ratio"] == pytest.approx(np.exp(logs.mean()))
-
-
-def test_the_table_shows_the_published_rows(
-    chains: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["--db", chains, "--out", str(tmp_path)])
-    shown = capsys.readouterr().out
-    assert "published: FLEX" in shown
-    assert "published: random" in shown
+    assert "published: FLEX" in made.shown
     assert table_3.published_exponent("FLEX") == pytest.approx(1.18, abs=0.005)
 
 
@@ -213,18 +186,8 @@ STARS = [star(*each) for each in (("random", 0), ("random", 1), ("exact", 0), ("
 STARS += [star("random", seed, 0.01) for seed in (0, 1)]
 
 
-@pytest.fixture(scope="module")
-def stars(tmp_path_factory: pytest.TempPathFactory) -> str:
-    address = f"sqlite:///{tmp_path_factory.mktemp('star')}/results.db"
-    fill(address, STARS, edit=simulated)
-    return address
-
-
-def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(
-    stars: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--db", stars, "--out", str(tmp_path)]) == 0
-    table = pd.read_csv(tmp_path / "flex_star_trials.csv").set_index(["learner", "policy", "seed"])
+def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(made: Made) -> None:
+    table = made.read("flex_star_trials").set_index(["learner", "policy", "seed"])
     assert len(table) == len(STARS)
     for spec in STARS:
         rate = spec.learner.learning_rate
@@ -234,17 +197,12 @@ def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(
         distance = np.hypot(*(theta - 0.9 * np.array([np.cos(angle), np.sin(angle)])))
         row = table.loc[(f"adam, rate {rate:g}", spec.policy.name, spec.seed)]
         assert row.error == pytest.approx(0.5 * distance**2, rel=1e-9)
-    shown = capsys.readouterr().out
-    assert "published: FLEX" in shown
-    assert "adam, rate 0.01" in shown
+    assert "adam, rate 0.01" in made.shown
 
 
-def test_medians_counts_and_ratios_of_stars_follow_from_the_trials(
-    stars: str, tmp_path: Path
-) -> None:
-    main(["--db", stars, "--out", str(tmp_path)])
-    trials = pd.read_csv(tmp_path / "flex_star_trials.csv")
-    table = pd.read_csv(tmp_path / "flex_star.csv").set_index(["learner", "policy"])
+def test_medians_counts_and_ratios_of_stars_follow_from_the_trials(made: Made) -> None:
+    trials = made.read("flex_star_trials")
+    table = made.read("flex_star").set_index(["learner", "policy"])
     by_seed = trials.pivot_table(index="seed", columns=["learner", "policy"], values="error")
     assert (table["median"] == by_seed.median().reindex(table.index)).all()
     assert (table.lost == (by_seed > 0.5).sum().reindex(table.index)).all()
@@ -291,25 +249,37 @@ def solved_as_listed(spec: TrialSpec, result: TrialResult) -> TrialResult:
 SWINGS = [swing_up(*one) for one in SOLVED]
 
 
+class Made(NamedTuple):
+    """Folder of the tables of a database, and what was printed."""
+
+    folder: Path
+    shown: str
+
+    def read(self, name: str) -> pd.DataFrame:
+        return pd.read_csv(self.folder / f"{name}.csv")
+
+
 @pytest.fixture(scope="module")
-def swings(tmp_path_factory: pytest.TempPathFactory) -> str:
-    address = f"sqlite:///{tmp_path_factory.mktemp('swing_up')}/results.db"
-    fill(address, SWINGS, edit=solved_as_listed)
-    return address
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Return all tables of one database with small grids of each kind."""
+    folder = tmp_path_factory.mktemp("published")
+    fill(f"sqlite:///{folder}/r.db", [*DISKS, *SPECS, *STARS], edit=simulated)
+    fill(f"sqlite:///{folder}/r.db", SWINGS, edit=solved_as_listed)
+    with contextlib.redirect_stdout(io.StringIO()) as shown:
+        assert main(["--db", f"sqlite:///{folder}/r.db", "--out", str(folder)]) == 0
+    return Made(folder, shown.getvalue())
 
 
-def test_samples_are_those_after_which_every_episode_succeeds(swings: str, tmp_path: Path) -> None:
-    assert main(["--db", swings, "--out", str(tmp_path)]) == 0
-    table = pd.read_csv(tmp_path / "flex_table1_trials.csv").set_index(["policy", "seed"])
+def test_samples_are_those_after_which_every_episode_succeeds(made: Made) -> None:
+    table = made.read("flex_table1_trials").set_index(["policy", "seed"])
     assert len(table) == len(SAMPLES)
     for key, expected in SAMPLES.items():
         assert tuple(table.loc[key, ["samples", "first"]]) == expected
     assert set(table.horizon) == {30}
 
 
-def test_medians_and_improvements_follow_from_the_trials(swings: str, tmp_path: Path) -> None:
-    main(["--db", swings, "--out", str(tmp_path)])
-    table = pd.read_csv(tmp_path / "flex_table1.csv").set_index("policy")
+def test_medians_and_improvements_follow_from_the_trials(made: Made) -> None:
+    table = made.read("flex_table1").set_index("policy")
     assert tuple(table.samples[["d_optimal", "random"]]) == (10, np.inf)
     assert tuple(table["first"][["d_optimal", "random"]]) == (10, 10)
     assert tuple(table.samples_unsolved[["d_optimal", "random"]]) == (0, 2)
@@ -328,11 +298,8 @@ def test_a_trial_that_diverged_is_not_solved(tmp_path: Path) -> None:
     assert tuple(table.loc[("d_optimal", 1), ["samples", "first"]]) == (np.inf, 10)
 
 
-def test_the_tables_show_the_published_rows_and_what_is_censored(
-    swings: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["--db", swings, "--out", str(tmp_path)])
-    lines = capsys.readouterr().out.splitlines()
+def test_the_tables_show_the_published_rows_and_what_is_censored(made: Made) -> None:
+    lines = made.shown.splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     assert ["policy", "pendulum, mlp"] in rows
     assert ["published: RHC", "500"] in rows

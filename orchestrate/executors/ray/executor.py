@@ -17,7 +17,6 @@ import socket
 import sys
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -62,43 +61,16 @@ TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": 
 _TOKEN = "RAY_AUTH_TOKEN"
 
 
-class Connection(ABC):
-    """Ray instance that runs chunks."""
-
-    limit: int | None = None
-    """Largest number of chunks submitted to Ray at once; None for no limit."""
-
-    @abstractmethod
-    def connect(self) -> None:
-        """Connect, or raise ``InfrastructureError``, or ``LaunchError`` where nothing can start."""
-
-    @property
-    @abstractmethod
-    def slots(self) -> int:
-        """Number of tasks that run at the same time, now."""
-
-    @abstractmethod
-    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
-        """Start a chunk and return the stream of its outcomes."""
-
-    @abstractmethod
-    def check(self) -> None:
-        """Raise ``InfrastructureError`` if Ray is lost."""
-
-    @abstractmethod
-    def disconnect(self, *, lost: bool) -> None:
-        """Disconnect from Ray, which does not answer any more if it is ``lost``."""
-
-    @staticmethod
-    def _init(address: str, **options: Any) -> None:
-        if ray.is_initialized():
-            ray.shutdown()  # the rest of a lost connection
-        # Ray prints more than a hundred lines, such as a memory map, for a lost node.
-        ray._private.worker.print_to_stdstream = _print_nothing
-        try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
-        except Exception as error:
-            raise unreachable(address, error) from None
+def _init(address: str, **options: Any) -> None:
+    """Connect to Ray, or raise ``InfrastructureError``, or ``LaunchError`` where none can start."""
+    if ray.is_initialized():
+        ray.shutdown()  # the rest of a lost connection
+    # Ray prints more than a hundred lines, such as a memory map, for a lost node.
+    ray._private.worker.print_to_stdstream = lambda *_, **__: None
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+    except Exception as error:
+        raise unreachable(address, error) from None
 
 
 def unreachable(address: str, error: Exception) -> DoptError:
@@ -121,9 +93,6 @@ def first_line(error: Exception) -> str:
     line = lines[0] if lines else type(error).__name__
     token = os.environ.get(_TOKEN)
     return line.replace(token, "***") if token else line
-
-
-def _print_nothing(*_: object, **__: object) -> None: ...
 
 
 _STDERR = 2  # Ray writes it to a log file of the worker on its node
@@ -154,11 +123,14 @@ OBJECT_STORE_BYTES = 256 * 2**20
 """Size of the store for outcomes in transfer; by default Ray takes a third of the memory."""
 
 
-class OwnRay(Connection):
+class OwnRay:
     """Ray with ``workers`` processes, by default one on each core."""
 
+    limit: int | None = None
+    """Largest number of chunks submitted to Ray at once; None for no limit."""
+
     def __init__(self, workers: int | None) -> None:
-        self._workers = workers or usable_cores()
+        self.slots = workers or usable_cores()
 
     def connect(self) -> None:
         # Workers inherit this environment, which is seconds faster than a runtime environment.
@@ -168,24 +140,21 @@ class OwnRay(Connection):
         self._task: Any = ray.remote(**TASK_OPTIONS)(run_chunk)
 
     def _start(self) -> None:
-        self._init(
+        _init(
             "local",
-            num_cpus=self._workers,
+            num_cpus=self.slots,
             object_store_memory=OBJECT_STORE_BYTES,
             include_dashboard=False,
             # Of a client's job Ray's workers look for no modules in the working folder.
             job_config=JobConfig(_client_job=True),
         )
 
-    @property
-    def slots(self) -> int:
-        return self._workers
-
     def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+        """Start a chunk and return the stream of its outcomes."""
         return self._task.remote(run, tasks, limits, None)
 
     def check(self) -> None:
-        """Check that Ray's processes run; Ray itself notices after a minute."""
+        """Raise ``InfrastructureError`` if Ray is lost, which Ray notices after a minute."""
         node: Any = ray._private.worker._global_node
         if node is None:
             return
@@ -197,6 +166,7 @@ class OwnRay(Connection):
             )
 
     def disconnect(self, *, lost: bool) -> None:  # noqa: ARG002  # there is always a process to end
+        """Disconnect from Ray, which does not answer any more if it is ``lost``."""
         ray.shutdown()
 
 
@@ -287,7 +257,7 @@ _SETTING = "RAY_"
 _verified: list[bool] = []  # not empty once this process has compared its fingerprint
 
 
-class Cluster(Connection):
+class Cluster:
     """Cluster with its head at ``address``; ``workers`` limits the cores that are used.
 
     ``prepare`` is called on every worker before its first trial.
@@ -305,7 +275,7 @@ class Cluster(Connection):
 
     def connect(self) -> None:
         self._check_head()
-        self._init(self._address, runtime_env={"env_vars": ONE_THREAD})
+        _init(self._address, runtime_env={"env_vars": ONE_THREAD})
         for module in (alike, sys.modules[__name__]):
             cloudpickle.register_pickle_by_value(module)  # type: ignore[no-untyped-call]
         self._task = ray.remote(**TASK_OPTIONS)(run_where_alike)
@@ -314,6 +284,7 @@ class Cluster(Connection):
 
     @property
     def slots(self) -> int:
+        """Number of tasks that run at the same time, now."""
         return self._workers or max(1, self._watch.cores)
 
     def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
@@ -484,11 +455,9 @@ class RayExecutor(Executor):
     ) -> None:
         self._run = run
         self._limits = limits
-        self._ray: Connection
-        if address == "local":
-            self._ray = OwnRay(workers)
-        else:
-            self._ray = Cluster(address, workers, prepare)
+        self._ray: OwnRay | Cluster = (
+            OwnRay(workers) if address == "local" else Cluster(address, workers, prepare)
+        )
         self._queue: deque[Sequence[Task]] = deque()
         self._chunks: dict[Any, Chunk] = {}
         self._lost = False

@@ -367,7 +367,6 @@ class Backend(ABC):
         self.engine = engine
         self.safe_url = safe_url
         self._has_answered = False
-        """Whether the database has the table of packed curves."""
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:

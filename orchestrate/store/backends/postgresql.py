@@ -5,12 +5,11 @@ from __future__ import annotations
 import threading
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from itertools import count, repeat
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from sqlalchemy import (
@@ -264,7 +263,7 @@ def _clock(connection: Connection) -> float:
 
 
 def _write_engine(url: URL, lease_seconds: float, patience: float, session: str) -> Engine:
-    engine = _engine(url, {"application_name": f"{_SESSION} {session}"})
+    engine = _engine(url, application_name=f"{_SESSION} {session}")
 
     @event.listens_for(engine, "connect")
     def _bound_silence(connection: psycopg.Connection, _: object) -> None:
@@ -310,14 +309,14 @@ def request(url: URL) -> dict[str, Any]:
     return {"driver": "postgresql", "connection": {**_settings(url), **arguments}}
 
 
-def _settings(url: URL, more: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+def _settings(url: URL, **more: str) -> dict[str, str]:
     wanted = {**_CONNECTION, **more}
     return {key: value for key, value in wanted.items() if key not in url.query}
 
 
-def _engine(url: URL, more: Mapping[str, str] = MappingProxyType({})) -> Engine:
+def _engine(url: URL, **more: str) -> Engine:
     try:
-        return create_engine(url, connect_args=_settings(url, more), pool_pre_ping=True)
+        return create_engine(url, connect_args=_settings(url, **more), pool_pre_ping=True)
     except ModuleNotFoundError as error:
         raise StoreError(
             f"A PostgreSQL database needs the library {error.name}: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dopt import Explorer, Plant
+from dopt.systems.real import Flight
 from dopt.types import Array
 from orchestrate.store import Reader
 
@@ -34,6 +36,25 @@ def motor_acceleration(x: Array) -> float:
 def following(x: Array, u: Array, dt: float = MOTOR.dt) -> Array:
     """Return the state of the motor dt seconds later, by the Euler map."""
     return x + dt * np.array([x[1], 5.0 * u[0] + motor_acceleration(x)])
+
+
+class Rig:
+    """The motor behind a delay [samples], a lag [s] and a supply [V], and what acted."""
+
+    def __init__(
+        self, delay: float = 0.0, lag: float = 0.0, supply: float = math.inf, substeps: int = 1
+    ) -> None:
+        self._flight = Flight(round(delay, 9), lag, MOTOR.dt, 1)
+        self._supply, self._substeps = supply, substeps
+        self.x, self.time = np.array([0.1, 0.0]), 0.0
+        self.acted: list[Array] = []
+
+    def step(self, u: Array) -> Array:
+        self.acted.append(self._flight.depart(np.clip(u, -self._supply, self._supply)))
+        for _ in range(self._substeps):
+            self.x = following(self.x, self.acted[-1], MOTOR.dt / self._substeps)
+        self.time += MOTOR.dt
+        return self.x
 
 
 HOVERCRAFT = Plant(

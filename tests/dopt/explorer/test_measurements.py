@@ -13,174 +13,163 @@ import pytest
 from dopt import Explorer, Plant
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.explorer.saving import free_run_error
-from dopt.kernel.sensors import estimate_state
 from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
-from tests.dopt.kernel.twin import call
 
 
-class TestMeasurements:
-    """States that are late, lost, repeated, out of order or no numbers."""
+def begun(**given: Any) -> tuple[Explorer, np.ndarray]:
+    """Return an explorer after one step at 0.02 s, and its state."""
+    explorer = Explorer(MOTOR, steps=20, **given)
+    x = np.array([0.1, 0.0])
+    u = explorer.ask(x, time=0.0)
+    x = following(x, u)
+    assert explorer.tell(x, time=0.02)
+    return explorer, x
 
-    def begun(self, **given: Any) -> tuple[Explorer, np.ndarray]:
-        """Return an explorer after one step at 0.02 s, and its state."""
-        explorer = Explorer(MOTOR, steps=20, **given)
-        x = np.array([0.1, 0.0])
-        u = explorer.ask(x, time=0.0)
-        x = following(x, u)
-        assert explorer.tell(x, time=0.02)
-        return explorer, x
 
-    def test_repeated_and_older_ones_change_nothing(self) -> None:
-        explorer, x = self.begun()
-        explorer.ask(x, time=0.02)
-        before = explorer.parameters
-        assert not explorer.tell(x, time=0.02)
-        assert not explorer.tell(x + 1.0, time=0.01)
-        assert np.array_equal(explorer.parameters, before)
-        assert (explorer.counts["repeated"], explorer.counts["out_of_order"]) == (1, 1)
-        assert explorer.tell(following(x, explorer.ask(x)), time=0.04)
+def said(log: pytest.LogCaptureFixture, words: str) -> int:
+    return sum(words in record.message for record in log.records)
 
-    @pytest.mark.parametrize("value", [np.nan, np.inf, 1e5])
-    def test_unusable_ones_end_a_transition(self, value: float) -> None:
-        explorer, x = self.begun()
-        explorer.ask(x, time=0.02)
-        before = explorer.parameters
-        assert not explorer.tell([0.0, value], time=0.04)
-        assert not explorer.tell(x, time=0.06)  # from which the next step is taken
-        assert np.array_equal(explorer.parameters, before)
-        assert explorer.counts["unusable"] == 1
-        assert explorer.tell(following(x, explorer.ask(x)), time=0.08)
 
-    def test_an_unusable_state_is_answered_with_the_fallback(self) -> None:
-        explorer, _ = self.begun(fallback=[0.3])
-        assert explorer.ask([np.nan, 0.0], time=0.02) == 0.3
-        assert explorer.counts["unusable"] == 1
-        assert not explorer.tell([0.2, 0.0], time=0.04)  # from which it goes on
+def test_repeated_and_older_states_change_nothing() -> None:
+    explorer, x = begun()
+    explorer.ask(x, time=0.02)
+    before = explorer.parameters
+    assert not explorer.tell(x, time=0.02)
+    assert not explorer.tell(x + 1.0, time=0.01)
+    assert np.array_equal(explorer.parameters, before)
+    assert (explorer.counts["repeated"], explorer.counts["out_of_order"]) == (1, 1)
+    u = explorer.ask(x, time=0.02)
+    assert np.array_equal(explorer.ask([0.1, 0.0], time=0.0), u)  # the answer to the present one
+    assert explorer.counts["out_of_order"] == 2
+    assert explorer.tell(following(x, u))
+    assert explorer._state.time == pytest.approx(0.04)  # which goes on with the clock
 
-    @pytest.mark.parametrize("when", [0.025, 0.06])
-    def test_too_early_and_too_late_ones_are_gaps(self, when: float) -> None:
-        explorer, x = self.begun()
-        u = explorer.ask(x, time=0.02)
-        before = explorer.parameters
-        assert not explorer.tell(following(x, u), time=when)
-        assert np.array_equal(explorer.parameters, before)
-        assert explorer.counts["gaps"] == 1
-        assert explorer.n_steps == 1
 
-    def test_an_infinite_acceleration_is_unusable(self) -> None:
-        """The known part is infinite at one state: what is seen there is no number."""
-        known = {"angle": "rate", "rate": "gain * voltage + 1 / angle"}
-        pole = dataclasses.replace(MOTOR, known=known)
-        explorer = Explorer(pole, steps=20, learner="gauss_newton")
-        explorer.ask([0.0, 0.0])
-        assert not explorer.tell([0.1, 0.0], applied=[1.0])
-        assert explorer.counts["unusable"] == 1
-        assert explorer.n_steps == 0
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e5])
+def test_unusable_states_end_a_transition(value: float) -> None:
+    explorer, x = begun(fallback=[0.3])
+    explorer.ask(x, time=0.02)
+    before = explorer.parameters
+    assert not explorer.tell([0.0, value], time=0.04)
+    assert not explorer.tell(x, time=0.06)  # from which the next step is taken
+    assert np.array_equal(explorer.parameters, before)
+    assert explorer.counts["unusable"] == 1
+    assert explorer.tell(following(x, explorer.ask(x)), time=0.08)
+    assert explorer.ask([0.0, value], time=0.08) == 0.3
+    assert explorer.counts["unusable"] == 2
+    assert not explorer.tell([0.2, 0.0], time=0.1)  # from which it goes on
 
-    def test_an_angle_is_followed_over_many_turns(self) -> None:
-        """Measured over one turn, and beyond the limit over many."""
-        turning = [0.0, 2.5, 5.0, 7.5]
-        wrapped = [(a + np.pi) % (2 * np.pi) - np.pi for a in turning]
-        one, many = (Explorer(MOTOR, steps=20) for _ in range(2))
-        for explorer, angles in ((one, wrapped), (many, [a + 2e4 * np.pi for a in turning])):
-            explorer.ask([angles[0], 125.0])
-            assert all(explorer.tell([a, 125.0], applied=[1.0]) for a in angles[1:])
-        assert one.states[:, 0] == pytest.approx(turning)
-        assert one.parameters == pytest.approx(many.parameters, rel=1e-3)
 
-    def test_states_without_times_go_on_with_the_clock(self) -> None:
-        explorer, x = self.begun()
-        explorer.tell(following(x, explorer.ask(x)))
-        assert explorer._state.time == pytest.approx(0.04)
+@pytest.mark.parametrize("when", [0.025, 0.06])
+def test_too_early_and_too_late_states_are_gaps(when: float) -> None:
+    explorer, x = begun()
+    u = explorer.ask(x, time=0.02)
+    before = explorer.parameters
+    assert not explorer.tell(following(x, u), time=when)
+    assert np.array_equal(explorer.parameters, before)
+    assert (explorer.counts["gaps"], explorer.n_steps) == (1, 1)
 
-    def test_many_in_vain_are_said(self, caplog: pytest.LogCaptureFixture) -> None:
-        """Such as times in milliseconds."""
-        explorer = Explorer(MOTOR, steps=40)
-        with caplog.at_level("WARNING"):
-            for step in range(30):
-                explorer.ask([0.1, 0.0], time=20.0 * step)
-                explorer.tell([0.1, 0.0], time=20.0 * (step + 1))
-        assert len([r for r in caplog.records if "last 20 states" in r.message]) == 1
 
-    def test_states_that_are_never_told_are_said(self, caplog: pytest.LogCaptureFixture) -> None:
-        explorer = Explorer(MOTOR, steps=40)
-        with caplog.at_level("WARNING"):
-            for step in range(30):
-                explorer.ask([0.1 * step, 0.0])
-        assert len([r for r in caplog.records if "tell() each state" in r.message]) == 1
+def test_an_infinite_acceleration_is_unusable() -> None:
+    """The known part is infinite at one state: what is seen there is no number."""
+    known = {"angle": "rate", "rate": "gain * voltage + 1 / angle"}
+    explorer = Explorer(dataclasses.replace(MOTOR, known=known), steps=20, learner="gauss_newton")
+    explorer.ask([0.0, 0.0])
+    assert not explorer.tell([0.1, 0.0], applied=[1.0])
+    assert (explorer.counts["unusable"], explorer.n_steps) == (1, 0)
 
-    def test_a_clock_that_began_anew_is_said(
-        self, caplog: pytest.LogCaptureFixture, tmp_path: Path
-    ) -> None:
-        journal = tmp_path / "run.jsonl"
-        with Explorer(MOTOR, steps=40, journal=journal) as explorer:
-            explorer.ask([0.1, 0.0], time=1e3)
-        with Explorer(MOTOR, steps=40, journal=journal) as explorer, caplog.at_level("WARNING"):
-            for step in range(30):
-                explorer.tell([0.1, 0.1 * step], time=0.02 * step)
-                explorer.ask([0.1, 0.1 * step], time=0.02 * step)
-            assert explorer.counts["out_of_order"] == 30
-        said = "call reset() if their clock restarted"
-        assert len([r for r in caplog.records if said in r.message]) == 1
 
-    @pytest.mark.parametrize("timed", [False, True])
-    def test_a_state_that_is_told_and_asked_about_is_counted_once(self, timed: bool) -> None:
-        explorer, x = self.begun()
-        now = 0.02
-        bad = [("unusable", [7.0, np.nan], 0.04), ("unusable", [0.0, 1e5], 0.06)]
-        if timed:
-            bad = [("repeated", x + 1.0, now), ("out_of_order", x + 1.0, 0.01), *bad]
-        before = explorer.parameters
-        for kind, state, when in bad:
-            count = explorer.counts[kind]
-            for _ in range(2):
-                given = np.array(state)
-                if explorer.counts[kind] == count:
-                    assert not explorer.tell(given, time=when if timed else None)
-                explorer.ask(given, time=when if timed else None)
-                given[:] = 0.0
-            assert explorer.counts[kind] == count + 1
-        assert np.array_equal(explorer.parameters, before)
-        assert not explorer.tell(x, time=0.08)
-        assert explorer.tell(following(x, explorer.ask(x)), time=0.10)
+def test_an_angle_is_followed_over_many_turns() -> None:
+    """Measured over one turn, and beyond the limit over many."""
+    turning = [0.0, 2.5, 5.0, 7.5]
+    wrapped = [(a + np.pi) % (2 * np.pi) - np.pi for a in turning]
+    one, many = (Explorer(MOTOR, steps=20) for _ in range(2))
+    for explorer, angles in ((one, wrapped), (many, [a + 2e4 * np.pi for a in turning])):
+        explorer.ask([angles[0], 125.0])
+        assert all(explorer.tell([a, 125.0], applied=[1.0]) for a in angles[1:])
+    assert one.states[:, 0] == pytest.approx(turning)
+    assert one.parameters == pytest.approx(many.parameters, rel=1e-3)
 
-    @pytest.mark.parametrize("time", [np.nan, np.inf, "1", True, [0.1]])
-    def test_times_that_are_none_are_refused(self, time: Any) -> None:
-        explorer, x = self.begun()
-        with pytest.raises(SpecificationError, match="finite number of seconds"):
-            explorer.tell(x, time=time)
-        with pytest.raises(SpecificationError, match="finite number of seconds"):
-            explorer.ask(x, time=time)
 
-    def test_dt_is_measured(self) -> None:
-        """With jitter of a quarter of dt the accelerations are seen as they are."""
-        explorer, x = self.begun()
-        u = explorer.ask(x, time=0.02)
-        predicted = explorer.predict(x)[0, 0]
-        assert explorer.tell(following(x, u, 0.025), time=0.045)
-        assert explorer.errors[1] == pytest.approx(abs(motor_acceleration(x) - predicted), rel=1e-9)
+@pytest.mark.parametrize(
+    ("told", "seconds", "words"),
+    [(True, 20.0, "last 20 states"), (False, None, "tell() each state")],
+)
+def test_states_in_vain_or_never_told_are_said_once(
+    caplog: pytest.LogCaptureFixture, told: bool, seconds: float | None, words: str
+) -> None:
+    """Such as times in milliseconds."""
+    explorer = Explorer(MOTOR, steps=40)
+    for step in range(30):
+        explorer.ask([0.1 * step, 0.0], time=seconds and seconds * step)
+        if told:
+            explorer.tell([0.1 * step, 0.0], time=20.0 * (step + 1))
+    assert said(caplog, words) == 1
 
-    def test_a_state_that_was_not_told_is_a_jump(self) -> None:
-        explorer, _ = self.begun()
-        explorer.ask([1.0, 0.0], time=5.0)
-        assert explorer.counts["jumps"] == 1
-        assert explorer.tell(following(np.array([1.0, 0.0]), explorer.ask([1.0, 0.0])), time=5.02)
-        assert np.array_equal(explorer.states[1], [1.0, 0.0])
 
-    def test_the_answer_to_an_older_state_is_that_to_the_present_one(self) -> None:
-        explorer, x = self.begun()
-        u = explorer.ask(x, time=0.02)
-        assert np.array_equal(explorer.ask([0.1, 0.0], time=0.0), u)
-        assert explorer.counts["out_of_order"] == 1
-        assert explorer.tell(following(x, u), time=0.04)
-
-    def test_a_clock_that_starts_anew_is_followed_after_a_reset(self) -> None:
-        explorer, x = self.begun()
+def test_a_reset_follows_a_clock_that_began_anew(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    journal = tmp_path / "run.jsonl"
+    with Explorer(MOTOR, steps=40, journal=journal) as explorer:
+        explorer.ask([0.1, 0.0], time=1e3)
+    with Explorer(MOTOR, steps=40, journal=journal) as explorer:
+        for step in range(30):
+            explorer.tell([0.1, 0.1 * step], time=0.02 * step)
+            explorer.ask([0.1, 0.1 * step], time=0.02 * step)
+        assert explorer.counts["out_of_order"] == 30
+        assert said(caplog, "call reset() if their clock restarted") == 1
         explorer.reset()
-        u = explorer.ask(x, time=0.001)
-        assert explorer.tell(following(x, u), time=0.021)
-        assert (explorer.counts["resets"], explorer.counts["learned"]) == (1, 2)
+        x = np.array([0.1, 0.0])
+        assert explorer.tell(following(x, explorer.ask(x, time=0.001)), time=0.021)
+        assert (explorer.counts["resets"], explorer.counts["learned"]) == (1, 1)
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_state_that_is_told_and_asked_about_is_counted_once(timed: bool) -> None:
+    explorer, x = begun()
+    bad = [("unusable", [7.0, np.nan], 0.04), ("unusable", [0.0, 1e5], 0.06)]
+    if timed:
+        bad = [("repeated", x + 1.0, 0.02), ("out_of_order", x + 1.0, 0.01), *bad]
+    before = explorer.parameters
+    for kind, state, when in bad:
+        count = explorer.counts[kind]
+        for _ in range(2):
+            given = np.array(state)
+            if explorer.counts[kind] == count:
+                assert not explorer.tell(given, time=when if timed else None)
+            explorer.ask(given, time=when if timed else None)
+            given[:] = 0.0
+        assert explorer.counts[kind] == count + 1
+    assert np.array_equal(explorer.parameters, before)
+    assert not explorer.tell(x, time=0.08)
+    assert explorer.tell(following(x, explorer.ask(x)), time=0.10)
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf, "1", True, [0.1]])
+def test_times_that_are_none_are_refused(time: Any) -> None:
+    explorer, x = begun()
+    for call in (explorer.tell, explorer.ask):
+        with pytest.raises(SpecificationError, match="finite number of seconds"):
+            call(x, time=time)
+
+
+def test_dt_is_measured() -> None:
+    """With jitter of a quarter of dt the accelerations are seen as they are."""
+    explorer, x = begun()
+    u = explorer.ask(x, time=0.02)
+    predicted = explorer.predict(x)[0, 0]
+    assert explorer.tell(following(x, u, 0.025), time=0.045)
+    assert explorer.errors[1] == pytest.approx(abs(motor_acceleration(x) - predicted), rel=1e-9)
+
+
+def test_a_state_that_was_not_told_is_a_jump() -> None:
+    explorer, _ = begun()
+    explorer.ask([1.0, 0.0], time=5.0)
+    assert explorer.counts["jumps"] == 1
+    assert explorer.tell(following(np.array([1.0, 0.0]), explorer.ask([1.0, 0.0])), time=5.02)
+    assert np.array_equal(explorer.states[1], [1.0, 0.0])
 
 
 DEGREE = math.pi / 180
@@ -264,26 +253,16 @@ def test_questions_about_other_measurements_are_warned_of(caplog: Any) -> None:
 def test_filters_begin_anew_after_a_reset(learner: str) -> None:
     """What comes after it is estimated as from the start of an exploration."""
     given = JOINT if learner == "joint_ekf" else {"learner": learner}
-    explorer, other = (Explorer(ENCODER, steps=60, **given) for _ in range(2))
+    explorer, fresh = (Explorer(ENCODER, steps=60, **given) for _ in range(2))
     driven(explorer, 20)
     explorer.reset()
-    steps, fresh = explorer._state.steps, other._state.steps
-    for one, at in ((steps, 20), (fresh, 0)):
-        state: Any = one
-        state.begin(at, np.array([0.3, 0.0]))
-        state.inputs[at], state.state.estimate.outputs[at] = 1.0, 0.31
-        call(estimate_state, state.trial, at, 0.02)
+    for one in (explorer, fresh):
+        one.ask([0.3])
+        assert one.tell([0.31], applied=[1.0])
     if learner == "adam_window":  # the filter over both predicts with what it has learned
-        np.testing.assert_array_equal(steps.states[21], fresh.states[1])
-    estimate: Any = steps.state.estimate  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(explorer.states[-1], fresh.states[-1])
+    estimate: Any = explorer._state.steps.state.estimate  # type: ignore[attr-defined]
     assert estimate.starts[20, 0] == 0.3
-
-
-def test_states_are_measured_in_their_own_order() -> None:
-    noises = {"rate": 0.1, "angle": DEGREE}
-    plant = dataclasses.replace(MOTOR, measured=noises).system(10)
-    assert plant.measured_states == (0, 1)
-    assert plant.measurement_noise == (DEGREE, 0.1)
 
 
 def test_an_angle_may_be_measured_over_one_turn() -> None:
@@ -301,26 +280,20 @@ def test_an_angle_may_be_measured_over_one_turn() -> None:
     np.testing.assert_allclose(turning.parameters, unrolled.parameters, atol=1e-6)
 
 
-def test_what_is_told_is_what_is_measured() -> None:
-    explorer = Explorer(ENCODER, steps=10, **JOINT)
-    with pytest.raises(SpecificationError, match="shape"):
-        explorer.ask([0.1, 0.0])
-
-
-def test_a_plant_says_what_is_measured() -> None:
+def test_a_plant_says_what_is_measured_in_the_order_of_its_states() -> None:
     section = ENCODER.to_section()
     assert section["measured"] == {"angle": DEGREE}
     assert Plant.from_section(section | {"horizon": 10}).measured_states == (0,)
     assert "measured" not in MOTOR.to_section()
-
-
-@pytest.mark.parametrize(
-    ("measured", "said"),
-    [({"place": 1.0}, "place"), ({"angle": 0.0}, "positive"), (["angle"], "mapping")],
-)
-def test_what_cannot_be_measured_is_refused(measured: Any, said: str) -> None:
-    with pytest.raises(SpecificationError, match=said):
-        dataclasses.replace(MOTOR, measured=measured)
+    both = dataclasses.replace(MOTOR, measured={"rate": 0.1, "angle": DEGREE}).system(10)
+    assert both.measured_states == (0, 1)
+    assert both.measurement_noise == (DEGREE, 0.1)
+    with pytest.raises(SpecificationError, match="shape"):
+        Explorer(ENCODER, steps=10, **JOINT).ask([0.1, 0.0])
+    wrong: list[tuple[Any, str]] = [({"place": 1.0}, "place"), ({"angle": 0.0}, "positive")]
+    for measured, words in [*wrong, (["angle"], "mapping")]:
+        with pytest.raises(SpecificationError, match=words):
+            dataclasses.replace(MOTOR, measured=measured)
 
 
 def test_a_rate_without_its_angle_needs_the_filter() -> None:

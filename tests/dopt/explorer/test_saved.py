@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import signal
+import itertools
+import shutil
 import sqlite3
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,33 +32,13 @@ from dopt.systems import System
 from dopt.types import Array
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
-from orchestrate.store import (
-    Reader,
-    Store,
-    StoreError,
-    StoreUnavailableError,
-    default_url,
-    explorations,
-)
-from orchestrate.store import results as writing
+from orchestrate.store import Reader, Store, StoreError, StoreUnavailableError
+from orchestrate.store import store as writing
 from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
 from tests.dopt.explorer.plants import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN, begin
 from tests.orchestrate.store.test_leases import wait_for_renewals
-from tests.paths import ROOT
-
-
-def test_it_runs_until_it_is_closed(url: str, run: Explorer) -> None:
-    def state() -> str:
-        with Reader.open(url) as reader:
-            [found] = explorations(reader)
-            return found.state
-
-    run.save(url)
-    assert state() == "running, 40 of 300 steps"
-    run.close()
-    assert state() == "done, 40 of 300 steps"
 
 
 def test_what_ask_and_tell_took_is_stored(url: str, run: Explorer) -> None:
@@ -69,9 +48,8 @@ def test_what_ask_and_tell_took_is_stored(url: str, run: Explorer) -> None:
     whole = 1e6 * (time.perf_counter() - begun)
     run.save(url)
     with Reader.open(url) as reader:
-        rows = [*map(tuple, reader.rows("SELECT plan_us, learn_us FROM step ORDER BY t"))]
-    times = np.array(rows, dtype=float)[-10:]
-    assert times.shape == (10, 2)
+        rows = reader.rows("SELECT plan_us, learn_us FROM step ORDER BY t")
+        times = np.array([tuple(row) for row in rows], dtype=float)[-10:]
     assert (times > 0.1).all()
     assert times.sum() < whole
     t, x = run.n_steps, run.states[-1]
@@ -133,43 +111,43 @@ def test_a_merge_takes_it_and_what_it_has_grown_by(url: str, tmp_path: Path, run
     assert not examine(target, trial_key)
 
 
-def test_a_merge_keeps_another_run_of_the_same_arguments_apart(
+def test_another_run_of_these_arguments_stays_apart(
     url: str, tmp_path: Path, run: Explorer
 ) -> None:
     run.save(url)
+    before = content(url)
     with explorer() as other:
         other.ask([0.3, 0.0])
         other.tell([0.3, 0.1])
+        with pytest.raises(StoreError, match=r"holds another exploration .* \(40 steps\).*seed"):
+            other.save(url)
         other.save(f"sqlite:///{tmp_path}/other.db")
+    with Reader.open(url) as reader:
+        assert len(reader.launches()) == 1
     assert len(merge(url, f"sqlite:///{tmp_path}/other.db").conflicts) == 1
+    assert content(url) == before
 
 
-@pytest.fixture
-def client(url: str) -> Iterator[TestClient]:
-    app = create_app(url)
-    with TestClient(app, base_url="http://127.0.0.1:8000") as opened:
-        yield opened
-
-
-def test_the_pages_show_it_live(url: str, client: TestClient, run: Explorer) -> None:
-    run.save(url, test=(run.states, run.inputs) if run.n_steps > 50 else None)
-    key = content(url)["trial_key"]
-    for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
-        assert client.get(page).status_code == 200, page
-    assert "prequential loss" in client.get("/").text
-    assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text
-    arrays = client.get(f"/api/trials/{key}/arrays").json()
-    assert arrays["loss"] == run.errors.tolist()
-    assert arrays["is_prequential"] is True
-    assert arrays["phase"]["labels"] == ["angle [rad]", "rate [rad/s]"]
-    token = client.get("/api/grid").json()["progress"]["token"]
-    assert len(client.get("/api/curves?env=plant").json()["x"]) == 40
-    drive(run, 10)
+def test_the_pages_show_it_live(url: str, run: Explorer) -> None:
     run.save(url)
-    assert client.get("/api/grid").json()["progress"]["token"] != token
-    assert len(client.get("/api/curves?env=plant").json()["x"]) == 50
-    run.close()
-    assert "done, 50 of 300 steps" in client.get(f"/trials/{key}").text
+    key = content(url)["trial_key"]
+    with TestClient(create_app(url), base_url="http://127.0.0.1:8000") as client:
+        for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
+            assert client.get(page).status_code == 200, page
+        assert "prequential loss" in client.get("/").text
+        assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text
+        arrays = client.get(f"/api/trials/{key}/arrays").json()
+        assert arrays["loss"] == run.errors.tolist()
+        assert arrays["is_prequential"] is True
+        assert arrays["phase"]["labels"] == ["angle [rad]", "rate [rad/s]"]
+        token = client.get("/api/grid").json()["progress"]["token"]
+        assert len(client.get("/api/curves?env=plant").json()["x"]) == 40
+        drive(run, 10)
+        run.save(url)
+        assert client.get("/api/grid").json()["progress"]["token"] != token
+        assert len(client.get("/api/curves?env=plant").json()["x"]) == 50
+        run.close()
+        assert "done, 50 of 300 steps" in client.get(f"/trials/{key}").text
 
 
 def test_a_frame_of_runs_of_unequal_length(sqlite_url: str, run: Explorer) -> None:
@@ -191,15 +169,18 @@ def test_a_frame_of_runs_of_unequal_length(sqlite_url: str, run: Explorer) -> No
     assert np.array_equal(model.predict(states), run.predict(states))
 
 
+def drive_through(one: Explorer, states: Array) -> None:
+    """Let an explorer meet given states."""
+    for x, following in itertools.pairwise(states):
+        one.ask(x)
+        one.tell(following)
+
+
 def test_it_is_not_compared_with_simulated_trials(sqlite_url: str) -> None:
     system = dopt.SYSTEMS["pendulum"](horizon=20)
     for policy in ("d_optimal", "random"):
         with Explorer(system, policy=policy) as one:
-            x = np.zeros(2)
-            for _ in range(20):
-                one.ask(x)
-                x = x + 0.01
-                one.tell(x)
+            drive_through(one, np.linspace([0.0, 0.0], [0.2, 0.2], 21))
             one.save(sqlite_url)
     with Reader.open(sqlite_url) as reader:
         selection = select(reader, Filter())
@@ -209,7 +190,7 @@ def test_it_is_not_compared_with_simulated_trials(sqlite_url: str) -> None:
             compare_policies(reader, selection)
 
 
-def test_the_caption_of_its_curve_names_no_grid(
+def test_the_caption_of_a_curve_names_no_grid(
     sqlite_url: str, run: Explorer, tmp_path: Path
 ) -> None:
     run.save(sqlite_url)
@@ -248,9 +229,7 @@ def test_a_database_that_is_gone_is_said_and_written_anew(
 
 
 @pytest.mark.parametrize("table", ["trial", "launch"])
-def test_rows_that_were_deleted_by_hand_are_said(
-    table: str, sqlite_url: str, run: Explorer
-) -> None:
+def test_rows_deleted_by_hand_are_said(table: str, sqlite_url: str, run: Explorer) -> None:
     run.save(sqlite_url)
     with sqlite3.connect(sqlite_url.removeprefix("sqlite:///")) as connection:
         connection.execute(f"DELETE FROM {table}")
@@ -261,8 +240,14 @@ def test_rows_that_were_deleted_by_hand_are_said(
     run.close()
 
 
-def test_what_is_stored_is_what_was_explored(url: str, run: Explorer) -> None:
-    assert run.save(url)
+def test_stored_is_what_was_explored(
+    url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a URL it is the database of the launches; and nothing is before the first step."""
+    monkeypatch.setenv("DOPT_DB", url)
+    with explorer() as one:
+        assert not one.save(url)
+    assert run.save()
     with Reader.open(url) as reader:
         [config] = reader.configs()
         curves = reader.curves(config.config_key)
@@ -270,9 +255,8 @@ def test_what_is_stored_is_what_was_explored(url: str, run: Explorer) -> None:
         [trial] = reader.trials(config.config_key)
     assert np.array_equal(curves.values, [run.errors])
     assert curves.t.tolist() == list(range(40))
-    assert np.array_equal(stored.states, run.states)
-    assert np.array_equal(stored.inputs, run.inputs)
-    assert np.array_equal(stored.parameters, run.parameters)
+    for name in ("states", "inputs", "parameters"):
+        assert np.array_equal(getattr(stored, name), getattr(run, name))
     assert (trial.status, trial.n_steps, trial.final_loss) == ("done", 40, run.errors[-1])
     assert (config.env, config.horizon) == ("plant", STEPS)
     assert config.label == "random, prequential loss"
@@ -296,7 +280,7 @@ def test_an_exploration_by_a_policy_of_a_script_is_saved(sqlite_url: str) -> Non
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_saved_while_it_grows_is_saved_at_the_end(
+def test_saved_on_the_way_is_saved_at_the_end(
     closed: bool, url: str, tmp_path: Path, run: Explorer
 ) -> None:
     for steps in (0, 1, 3, 130):
@@ -310,41 +294,14 @@ def test_saved_while_it_grows_is_saved_at_the_end(
     assert not examine(url, trial_key)
 
 
-def test_nothing_is_stored_before_the_first_step(sqlite_url: str) -> None:
-    with explorer() as one:
-        assert not one.save(sqlite_url)
-        with Reader.open(sqlite_url) as reader:
-            assert not reader.configs()
-
-
-def test_the_default_is_the_database_of_the_launches(
-    run: Explorer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/named.db")
-    run.save()
-    assert content(default_url())["n_steps"] == 40
-
-
-def test_the_states_of_a_trial_have_its_inputs_but_another_loss_and_go_behind_it(
-    sqlite_url: str,
-) -> None:
+def test_beside_a_trial_of_the_same_system_it_is_another_configuration(sqlite_url: str) -> None:
     system = dopt.SYSTEMS["pendulum"](horizon=30)
     spec = TrialSpec.of_system(system, "d_optimal")
     trial = dopt.run_trial(spec)
     with Explorer(system) as one:
-        for x, x_next in zip(trial.states, trial.states[1:], strict=False):
-            one.ask(x)
-            one.tell(x_next)
+        drive_through(one, trial.states)
         one.save(sqlite_url)
-    with Reader.open(sqlite_url) as reader:
-        [config] = reader.configs()
-        stored = reader.trajectory(config.config_key, 0)
-    assert np.array_equal(stored.inputs, trial.inputs)
-    assert np.array_equal(stored.states, trial.states)
-    assert config.env == "pendulum"
-    assert config.config_key != spec.config_key
     assert content(sqlite_url)["trial_key"] != spec.trial_key
-    assert config.label.endswith("prequential loss")
     with Store.open(sqlite_url) as store:
         launch, [claim] = begin(store, spec)
         assert store.commit(claim, trial, RUN)
@@ -375,19 +332,6 @@ def test_the_error_on_a_test_run_is_stored(sqlite_url: str, run: Explorer) -> No
         run.save(sqlite_url, test=run.states)  # type: ignore[arg-type]
 
 
-def test_another_run_of_the_same_arguments_is_refused(url: str, run: Explorer) -> None:
-    run.save(url)
-    before = content(url)
-    with explorer() as other:
-        other.ask([0.3, 0.0])
-        other.tell([0.3, 0.1])
-        with pytest.raises(StoreError, match=r"holds another exploration .* \(40 steps\).*seed"):
-            other.save(url)
-    assert content(url) == before
-    with Reader.open(url) as reader:
-        assert len(reader.launches()) == 1
-
-
 def test_fewer_steps_of_the_same_run_are_left_out(sqlite_url: str, run: Explorer) -> None:
     run.save(sqlite_url)
     before = content(sqlite_url)
@@ -401,28 +345,21 @@ def test_fewer_steps_of_the_same_run_are_left_out(sqlite_url: str, run: Explorer
     assert run.save(sqlite_url) is False, "the other one has gone further"
 
 
-def test_after_a_kill_the_journal_goes_on_with_the_same_trial(
-    sqlite_url: str, tmp_path: Path
-) -> None:
-    program = f"""
-import os, signal
-from tests.dopt.explorer.plants import drive, explorer
-one = explorer(journal={str(tmp_path / "run.jsonl")!r})
-for _ in range(3):
-    drive(one, 20)
-    one.save({sqlite_url!r})
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False)
-    assert done.returncode == -signal.SIGKILL
-    before = content(sqlite_url)
-    with explorer(journal=tmp_path / "run.jsonl") as again:
-        assert again.n_steps == before["n_steps"] == 60
-        again.save(sqlite_url)
-        assert content(sqlite_url) == before
-        drive(again, 10)
-        again.save(sqlite_url)
-        after = content(sqlite_url)
+def test_after_a_kill_the_journal_goes_on_with_the_same_trial(url: str, tmp_path: Path) -> None:
+    """What a kill leaves is the journal and a session that nobody has ended."""
+    with explorer(journal=tmp_path / "run.jsonl") as killed:
+        for _ in range(3):
+            drive(killed, 20)
+            killed.save(url)
+        before = content(url)
+        shutil.copy(tmp_path / "run.jsonl", tmp_path / "left.jsonl")
+        with explorer(journal=tmp_path / "left.jsonl") as again:
+            assert again.n_steps == before["n_steps"] == 60
+            again.save(url)
+            assert content(url) == before
+            drive(again, 10)
+            again.save(url)
+        after = content(url)
     assert after["trial_key"] == before["trial_key"]
     assert after["steps"][:60] == before["steps"]
     assert after["n_steps"] == 70

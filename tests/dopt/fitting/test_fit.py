@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 import dopt
 from dopt.errors import SpecificationError
+from dopt.fitting import problem
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import Simulator, Windows, first_states, solve, windows_of
@@ -22,15 +23,13 @@ from tests.paths import EXAMPLE, loaded
 
 
 def pendulum(**changed: object) -> dopt.Plant:
+    torque = "gain * voltage - damping * rate - gravity * sin(angle + offset)"
     given: dict[str, object] = {
         "states": {"angle": "rad", "rate": "rad/s"},
         "inputs": {"voltage": "V"},
         "dt": 0.02,
         "gamma": 3.0,
-        "known": {
-            "angle": "rate",
-            "rate": "gain * voltage - damping * rate - gravity * sin(angle + offset)",
-        },
+        "known": {"angle": "rate", "rate": torque},
         "constants": {
             "gain": dopt.unknown(20.0),
             "damping": dopt.unknown(1.0),
@@ -111,27 +110,19 @@ def test_sensitivities_agree_with_differences(width: int, seed: int) -> None:
     t, u = stamps(rng, 60, 0.3), rng.uniform(-2, 2, 60)
     plant = pendulum(delay=dopt.unknown(0.0, spread=0.02), lag=dopt.unknown(0.03))
     layout = Layout(np.array([0.0, 0.0, 0.5]), np.array([1.0, 1.0, 4.0]), np.array([9.0]))
-    how: dict[str, Any] = {
-        "longest_step": 0.002,
-        "delay": 0.0303,
-        "free_delay": True,
-        "free_lag": True,
-        "width": width,
-    }
-    sim = simulator(plant, t, np.zeros((60, 2)), u, layout=layout, **how)
-    p = sim.model.prior + 0.3 * rng.standard_normal(sim.model.q)
-    start = np.array([0.4, 1.0])
-    states, S = sim.slopes(p, 6, 50, start)
-    np.testing.assert_allclose(states, sim.states(p, 6, 50, start), rtol=0, atol=1e-12)
-    h = 1e-5
-    for j in range(sim.model.q + 2):
-        ahead, behind = (p.copy(), start.copy()), (p.copy(), start.copy())
-        for (parameters, state), sign in ((ahead, 1), (behind, -1)):
-            into, at = (parameters, j) if j < sim.model.q else (state, j - sim.model.q)
-            into[at] += sign * h
-        slope = (
-            sim.states(ahead[0], 6, 50, ahead[1]) - sim.states(behind[0], 6, 50, behind[1])
-        ) / (2 * h)
+    how: dict[str, Any] = {"longest_step": 0.002, "delay": 0.0303, "width": width}
+    how |= {"free_delay": True, "free_lag": True, "layout": layout}
+    sim = simulator(plant, t, np.zeros((60, 2)), u, **how)
+    q, h = sim.model.q, 1e-5
+    at = np.concatenate([sim.model.prior + 0.3 * rng.standard_normal(q), [0.4, 1.0]])
+
+    def states(both: Array) -> Array:
+        return sim.states(both[:q], 6, 50, both[q:])
+
+    found, S = sim.slopes(at[:q], 6, 50, at[q:])
+    np.testing.assert_allclose(found, states(at), rtol=0, atol=1e-12)
+    for j, move in enumerate(h * np.eye(q + 2)):
+        slope = (states(at + move) - states(at - move)) / (2 * h)
         np.testing.assert_allclose(S[:, :, j], slope, rtol=2e-4, atol=2e-5 * np.abs(slope).max())
 
 
@@ -159,28 +150,54 @@ def test_elimination_gives_the_step_of_the_whole_problem() -> None:
     np.testing.assert_allclose(np.linalg.solve(linear.normal, linear.slope), whole[:q], rtol=1e-8)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_fit_finds_constants_delay_and_lag(seed: int) -> None:
+def badly_begun(seed: int) -> tuple[Simulator, Windows, float]:
+    """Return a noisy run with drag, windows of up to four seconds, and starts far from it."""
     rng = np.random.default_rng(seed)
-    t, u = stamps(rng, 1500, 0.2), np.repeat(rng.uniform(-2, 2, 250), 6)
-    c, delay, lag = (24.0, 1.4, 33.0, 0.1), 0.013, 0.06
-    y = truth(t, u, delay, lag, np.array([0.0, 0.0]), c)
-    noisy = y + rng.standard_normal(y.shape) * [0.002, 0.02]
-    plant = pendulum(
-        measured={"angle": 0.002, "rate": 0.02},
-        delay=dopt.unknown(0.0, spread=0.02),
-        lag=dopt.unknown(0.04),
-    )
-    sim = simulator(plant, t, noisy, u, free_delay=True, free_lag=True)
-    rows = windows_of(sim.data, 0, 1499, 0.6, skip=0.1, ahead=0.05)
-    windows = Windows(rows, first_states(sim.data, sim.model, rows))
-    found = solve(sim, windows, sim.model.prior, 1.0)
-    values, _ = sim.model.named_values(found.p)
-    expected = dict(
-        zip(("gain", "damping", "gravity", "offset", "delay", "lag"), (*c, delay, lag), strict=True)
-    )
-    for name, value in expected.items():
-        assert values[name] == pytest.approx(value, rel=0.03, abs=0.003), name
+    table = run(seed, 600, drag=rng.uniform(0, 0.6))
+    table["angle"] += 0.01 * rng.standard_normal(len(table))
+    guesses = [value * np.exp(rng.normal()) for value in TRUE[:3]]
+    constants = {
+        **dict(zip(("gain", "damping", "gravity"), map(dopt.unknown, guesses), strict=True)),
+        "offset": dopt.unknown(0.0, spread=0.2),
+    }
+    plant = declared(measured={"angle": 0.01}, delay=0.02, constants=constants)
+    data = data_of(plant, [dopt.Log.for_plant(table, plant)], "zero")
+    model = Model(plant, delay=0.02)
+    rows = windows_of(data, 0, 599, float(rng.choice([0.4, 0.8, 2.0, 4.0])), skip=0.1, ahead=0.05)
+    starts = first_states(data, model, rows)
+    starts += rng.normal(size=starts.shape) * [0.3, 2.0]
+    return Simulator(model, data), Windows(rows, starts), float(rng.choice([1.0, 3.0]))
+
+
+def cost(sim: Simulator, found: problem.Solution, s: float) -> float:
+    prior = np.sum((found.p - sim.model.prior) ** 2)
+    return float(problem.robust(found.squares, found.scale).sum() / s**2 + prior)
+
+
+def test_what_has_converged_gains_nothing_from_another_beginning() -> None:
+    """A window whose start steps too far holds up no other: five of these fits were stuck."""
+    for seed in range(40):
+        sim, windows, s = badly_begun(seed)
+        found = solve(sim, windows, sim.model.prior, s)
+        settled = sim.settled(found.p, found.windows)
+        again = solve(sim, settled, found.p, s, scale=found.scale)
+        assert found.converged or found.steps == 30, "it still falls where its steps end"
+        assert not found.converged or cost(sim, again, s) > 0.98 * cost(sim, found, s), seed
+
+
+def test_a_fit_that_may_not_step_converges_at_a_minimum_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sim, windows, s = badly_begun(0)
+    found = solve(sim, windows, sim.model.prior, s, tolerance=1e-9)
+    monkeypatch.setattr(problem, "LARGEST_DAMPING", problem.FIRST_DAMPING)
+    stuck = solve(sim, windows, sim.model.prior, s)
+    assert (stuck.steps, stuck.converged) == (1, False)
+    again = solve(sim, found.windows, found.p, s, scale=found.scale)
+    assert (again.steps, again.converged) == (1, True)
+    starts = found.windows.starts + 0.01
+    moved = solve(sim, found.windows._replace(starts=starts), found.p, s, scale=found.scale)
+    assert not moved.converged, "its starts could fall"
 
 
 def test_an_input_that_was_measured_is_interpolated() -> None:
@@ -217,27 +234,19 @@ TRUE = (24.0, 1.4, 33.0, 0.1)
 
 
 def run(
-    seed: int,
-    n: int = 1200,
-    delay: float = 0.02,
-    drag: float = 0.0,
-    lag: float = 0.0,
-    counts: int = 4096,
+    seed: int, n: int = 1200, *, drag: float = 0.0, lag: float = 0.0, counts: int = 4096
 ) -> pd.DataFrame:
     """Return a run whose angle is measured in steps of a turn of so many counts."""
     rng = np.random.default_rng(seed)
     t, u = stamps(rng, n, 0.0), np.repeat(rng.uniform(-2.5, 2.5, n // 6), 6)
-    x = truth(t, u, delay, lag, np.zeros(2), TRUE, drag)
+    x = truth(t, u, 0.02, lag, np.zeros(2), TRUE, drag)
     quantum = 2 * math.pi / counts
     return pd.DataFrame({"time": t, "angle": np.round(x[:, 0] / quantum) * quantum, "voltage": u})
 
 
 def declared(**changed: object) -> dopt.Plant:
-    given: dict[str, object] = {
-        "measured": {"angle": dopt.encoder(4096)},
-        "delay": dopt.unknown(0.0, spread=0.02),
-    }
-    return pendulum(**(given | changed))
+    measured = {"angle": dopt.encoder(4096)}
+    return pendulum(**{"measured": measured, "delay": dopt.unknown(0.0, spread=0.02), **changed})
 
 
 @pytest.fixture(scope="module")
@@ -270,6 +279,8 @@ def test_a_network_is_kept_where_something_is_not_declared(fitted: Fitted) -> No
     by_model = {row["model"]: row["rms"] for row in rows}
     assert by_model["model"] < 0.7 * by_model["physics alone"] < by_model["linear"]
     assert fitted.verdict().startswith("Useful up to")
+    [row, *_] = [row for row in fitted.errors() if row["model"] == "model"]
+    assert f"median of the model {row['median']:.3g}\n" in fitted.report()
 
 
 def test_bounds_hold_what_they_say_on_another_run(fitted: Fitted) -> None:
@@ -282,18 +293,18 @@ def test_bounds_hold_what_they_say_on_another_run(fitted: Fitted) -> None:
     assert 0.8 <= fitted.coverage(0.9)["angle"] <= 0.98
 
 
-@pytest.mark.parametrize("columns", ["zero", "linear"])
-def test_a_saved_model_needs_numpy_alone(fitted: Fitted, tmp_path: Path, columns: str) -> None:
-    fitted.save(tmp_path / columns)
-    derivative, step = loaded(EXAMPLE / "load_model.py").load(tmp_path / f"{columns}.npz")
+def test_a_saved_model_needs_numpy_alone(fitted: Fitted, tmp_path: Path) -> None:
+    fitted.save(tmp_path / "model")
+    derivative, step = loaded(EXAMPLE / "load_model.py").load(tmp_path / "model.npz")
     rng = np.random.default_rng(1)
     x, u = rng.normal(size=(50, 2)) * [2.0, 8.0], rng.normal(size=(50, 1))
     expected = fitted.predict(x, u)
-    np.testing.assert_allclose(
-        [derivative(*at) for at in zip(x, u, strict=True)], expected, rtol=1e-9
-    )
+    found = [derivative(*at) for at in zip(x, u, strict=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
     reached = step(x[0], u[0], 1e-4)
     np.testing.assert_allclose((reached - x[0]) / 1e-4, expected[0], rtol=1e-2)
+    with pytest.raises(SpecificationError, match=r"give the URL to store\(\)"):
+        fitted.save("sqlite:///results.db")
 
 
 def test_the_module_of_torch_gives_the_same_derivatives(fitted: Fitted) -> None:
@@ -344,34 +355,16 @@ def test_the_report_says_whether_delay_and_lag_are_told_apart(
     assert delay + late == pytest.approx(0.02 + lag, abs=2e-3), "their sum is known in both cases"
 
 
-def test_the_median_of_the_report_is_of_the_model(fitted: Fitted) -> None:
-    [row, *_] = [row for row in fitted.errors() if row["model"] == "model"]
-    assert f"median of the model {row['median']:.3g}\n" in fitted.report()
-
-
-def test_a_url_is_no_file(fitted: Fitted) -> None:
-    with pytest.raises(SpecificationError, match=r"give the URL to store\(\)"):
-        fitted.save("sqlite:///results.db")
-
-
 def test_units_of_a_state_do_not_matter() -> None:
-    table, results = run(6), []
+    table, results = run(6, 600), []
     for unit in (1.0, 8.0, 1000.0):
-        plant = declared(
-            known={
-                "angle": f"rate * {unit}",
-                "rate": f"(gain * voltage - damping * rate * {unit} "
-                f"- gravity * sin(angle + offset)) / {unit}",
-            },
-            box={"rate": 10.0 / unit},
-        )
-        results.append(dopt.fit(plant, table, width=4, weights=(10.0,), window=0.6))
-    first = results[0]
+        force = f"gain * voltage - damping * rate * {unit} - gravity * sin(angle + offset)"
+        known = {"angle": f"rate * {unit}", "rate": f"({force}) / {unit}"}
+        plant = declared(known=known, box={"rate": 10.0 / unit})
+        results.append(dopt.fit(plant, table, width=4, weights=(10.0,), window=0.6).constants)
     for other, tolerance in zip(results[1:], (0.0, 1e-6), strict=True):
-        for name, (value, error) in first.constants.items():
-            assert other.constants[name] == pytest.approx((value, error), rel=tolerance, abs=0), (
-                name
-            )
+        for name, found in results[0].items():
+            assert other[name] == pytest.approx(found, rel=tolerance, abs=0), name
 
 
 @pytest.mark.parametrize(
@@ -383,19 +376,15 @@ def test_units_of_a_state_do_not_matter() -> None:
         ({"weights": (0.0,), "width": 4}, "weights is"),
         ({"workers": 0}, "workers is 0"),
         ({"logs": []}, "no log was given"),
-        (
-            {"logs": pd.DataFrame({"time": [0.0, 0.02], "angle": [0.0, 0.1], "voltage": 1.0})},
-            "longest piece",
-        ),
-        ({"logs": pd.DataFrame({"time": [0.0, 0.02], "angle": [0.0, 0.1]})}, "voltage"),
+        ({"logs": run(0, 6)[:2]}, "longest piece"),
+        ({"logs": run(0, 6)[["time", "angle"]]}, "voltage"),
+        ({"plant": {}}, r"dopt\.Plant is expected"),
     ],
 )
 def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) -> None:
-    given = {"logs": run(0, 60), "width": 0} | arguments
+    given = {"plant": declared(), "logs": run(0, 60), "width": 0} | arguments
     with pytest.raises(SpecificationError, match=said):
-        dopt.fit(declared(), **given)  # type: ignore[arg-type]
-    with pytest.raises(SpecificationError, match=r"dopt\.Plant is expected"):
-        dopt.fit({}, **given)  # type: ignore[arg-type]
+        dopt.fit(**given)  # type: ignore[arg-type]
 
 
 def test_a_plant_without_unknowns_gets_a_network_alone() -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 import analysis
@@ -21,8 +19,7 @@ from dopt.fitting.fitted import Fitted
 from dopt.systems.plant import Plant
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
-from orchestrate.store import Reader, StoreError, StoreUnavailableError
-from orchestrate.store import results as writing
+from orchestrate.store import Reader, StoreError
 from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
 from tests.analysis.synthetic import fill, make_grid
@@ -57,10 +54,8 @@ def stored(url: str) -> list[list[tuple[Any, ...]]]:
 
 def test_numbers_states_and_declaration_are_stored(url: str, found: Fitted) -> None:
     key = found.store(url)
-    values = {
-        (t, name): value
-        for t, name, value in rows(url, "SELECT t, measure, value FROM v_assessment")
-    }
+    assessed = rows(url, "SELECT t, measure, value FROM v_assessment")
+    values = {(t, name): value for t, name, value in assessed}
     with Reader.open(url) as reader:
         [trial] = reader.rows("SELECT * FROM v_trial")
         [config] = reader.configs()
@@ -70,7 +65,7 @@ def test_numbers_states_and_declaration_are_stored(url: str, found: Fitted) -> N
     assert (trial.trial_key, trial.status, trial.policy) == (key, "done", "recorded")
     assert (trial.model, trial.learner, trial.width) == ("constants", "simulation_error", None)
     assert trial.dt == pytest.approx(0.02)
-    assert trial.wall_seconds is None
+    assert trial.wall_seconds == found.selection.seconds > 0.0
     for name, (value, error) in found.constants.items():
         assert values[n, f"constant.{name}"] == pytest.approx(value, rel=1e-12)
         assert values[n, f"error.{name}"] == pytest.approx(error, rel=1e-12)
@@ -89,37 +84,36 @@ def test_numbers_states_and_declaration_are_stored(url: str, found: Fitted) -> N
     assert np.sqrt(np.mean(np.square(losses))) == pytest.approx(1.0, abs=0.5)
 
 
-def test_the_same_fit_has_one_row_and_another_its_own(url: str, found: Fitted) -> None:
+@pytest.fixture(scope="module")
+def others() -> list[Fitted]:
+    """Return fits that differ from the usual one in their log, options, or validation."""
+    validate = {"validate": run(1, ROWS)}
+    options: list[dict[str, Any]] = [{"seed": 1}, {"window": 0.4}, {"hold": "linear"}, validate]
+    return [fit(**one) for one in [*options, {"width": 2, "weights": (10.0,)}]]
+
+
+def test_a_fit_has_one_row_and_another_its_own(
+    url: str, found: Fitted, others: list[Fitted]
+) -> None:
     key = found.store(url)
     before = stored(url)
-    assert found.store(url) == fit().store(url) == key
+    assert found.store(url) == key
     assert stored(url) == before
-    assert rows(url, "SELECT count(*), max(attempt) FROM attempt") == [(3, 3)]
-    others = [fit(seed=1), fit(window=0.4), fit(width=2, weights=(10.0,)), fit(hold="linear")]
-    assert len({key, *(other.store(url) for other in others)}) == 5
-    validated = dopt.fit(declared(), run(0, ROWS), width=0, window=0.3, validate=run(1, ROWS))
-    validated.store(url)
+    assert rows(url, "SELECT count(*), max(attempt) FROM attempt") == [(2, 2)]
+    assert len({key, fit().store(url), *(other.store(url) for other in others)}) == 6
     assert rows(url, "SELECT count(*) FROM trial") == [(6,)]
-    assert not examine(url, trial_key)
-
-
-def test_a_database_that_fails_keeps_what_was_stored(
-    url: str, found: Fitted, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found.store(url)
-    before = stored(url)
-
-    def fail(*_: object) -> None:
-        raise OperationalError("INSERT", {}, sqlite3.OperationalError("disk I/O error"))
-
-    with monkeypatch.context() as broken:
-        broken.setattr(writing, "_replace_arrays", fail)
-        with pytest.raises(StoreUnavailableError, match=r"^The results database .* \(disk I/O"):
-            found.store(url)
-    assert stored(url) == before
     assert not examine(url, trial_key)
     with pytest.raises(StoreError, match=r"write it as sqlite:///results\.db"):
         found.store("results.db")
+
+
+def test_a_fit_with_a_network_has_its_seed_and_one_without_has_none(url: str) -> None:
+    dragged, how = run(0, ROWS, drag=0.4), {"window": 0.3, "weights": (10.0,)}
+    for seed, width in ((5, 4), (6, 4), (7, 0)):
+        found = dopt.fit(declared(), dragged, width=width, seed=seed, **how)  # type: ignore[arg-type]  # of several types
+        assert found.has_network == bool(width)
+        found.store(url)
+    assert sorted(rows(url, "SELECT seed FROM trial")) == [(0,), (5,), (6,)]
 
 
 def test_pages_commands_and_merges_know_it(

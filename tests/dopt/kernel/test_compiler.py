@@ -13,25 +13,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import llvmlite.binding
 import numpy as np
 import pytest
 
-from dopt.algorithm import Score, switch_step
+from dopt.algorithm import Score
 from dopt.errors import SpecificationError
 from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import content_digest
 from dopt.kernel.equations import name_of_equations
-from dopt.kernel.from_spec import network_of
+from dopt.kernel.from_spec import KINDS, network_of
 from dopt.kernel.information import FORMS
 from dopt.kernel.pointers import function_of
-from dopt.kernel.run import KernelTrial, trial_in_kernel
+from dopt.kernel.run import trial_in_kernel
 from dopt.kernel.warming import choices, kernel_parts, needed_parts
 from dopt.learning import LEARNERS
 from dopt.learning.base import Learner
-from dopt.models import Model
+from dopt.models import RFF
 from dopt.policies import POLICIES, Search
 from dopt.policies.base import ClosedLoop
 from dopt.policies.search import SCORES, score_code
@@ -41,6 +40,24 @@ from dopt.systems import SYSTEMS
 from tests.dopt.trials import trial
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
+
+
+def printed(program: str, *words: str, folder: Path = ROOT, **environment: str) -> str:
+    """Return what a program prints that runs in a process of its own, which may not fail."""
+    command = [sys.executable, "-c", program, *words]
+    given = os.environ | environment
+    done = subprocess.run(
+        command, env=given, cwd=folder, stdout=subprocess.PIPE, text=True, check=True
+    )
+    return done.stdout
+
+
+def cache_without(folder: Path, *names: str) -> str:
+    """Return a folder in which the cache is the warm one without some files."""
+    warm_up()
+    copy, without = folder / "dopt" / cache.CACHE_FOLDER.name, shutil.ignore_patterns(*names)
+    shutil.copytree(cache.CACHE_FOLDER, copy, copy_function=os.symlink, ignore=without)
+    return str(folder)
 
 
 @pytest.fixture
@@ -68,41 +85,25 @@ def test_a_second_compiler_of_a_function_waits_for_the_first(folder: Path) -> No
     assert after_first == [True]
 
 
-def test_compiling_is_said_at_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:  # noqa: ARG001
-    caplog.set_level("INFO")
-    with one_compiler_at_a_time("loop-1"):
-        [record] = caplog.records
-    assert record.name == "dopt.kernel"
-    assert "compiling the kernel, once per machine" in record.message
-    assert "loop" in record.message
-    with one_compiler_at_a_time("loop-1"):
-        pass
-    assert len(caplog.records) == 1
-
-
-def test_what_is_in_the_cache_is_read_by_all_at_once(folder: Path) -> None:
+def test_what_is_in_the_cache_is_read_by_all_at_once_and_what_failed_is_not(folder: Path) -> None:
+    with pytest.raises(KeyError), one_compiler_at_a_time("loop"):
+        raise KeyError
+    assert not (folder / "loop.complete").exists()
     with one_compiler_at_a_time("loop"):
         pass
     with one_compiler_at_a_time("other"), one_compiler_at_a_time("loop"):
         assert (folder / "loop.complete").exists()
 
 
-def test_a_failed_compilation_is_not_taken_for_a_complete_one(folder: Path) -> None:
-    with pytest.raises(KeyError), one_compiler_at_a_time("loop"):
-        raise KeyError
-    assert not (folder / "loop.complete").exists()
-
-
 def test_a_warm_cache_is_seen_without_the_compiler_and_a_trial_runs_without_its_rules() -> None:
     """Numba would load the rules first, for a tenth of a second in every process."""
     warm_up()
-    program = (
+    printed(
         "import sys; from dopt.kernel import warm_up; warm_up(); "
         "assert 'numba' not in sys.modules; from dopt import TrialSpec, run_trial; "
         "run_trial(TrialSpec.from_names('pendulum', 'd_optimal')); "
         "assert not {'numba.np.arraymath', 'numba.typed.typeddict'} & {*sys.modules}"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
 
 
 def test_everything_is_what_any_shipped_choice_calls() -> None:
@@ -119,47 +120,20 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
 
 def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
     """Where a trial compiles a part itself, its numbers can differ from later trials."""
-    program = (
-        "from dopt.kernel.cache import compile_missing\n"
-        "from dopt.kernel.information import add_nothing\n"
-        "from dopt.kernel.pointers import compile_form\n"
-        "from dopt.kernel.run import KernelTrial\n"
-        "from dopt.spec.trial import TrialSpec\n"
-        "compile_missing(['dopt.kernel.information.add_nothing'])\n"
-        "trial = KernelTrial(TrialSpec.from_names('pendulum', 'random')).trial\n"
-        "compile_form(trial, 'add_rows', add_nothing)\n"
-        "stats = add_nothing.stats\n"
-        "print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | {"DOPT_CACHE": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.split() == ["1", "0"]
-    assert "0 of 1 parts" in done.stderr
-
-
-def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(pointers, "compile_missing", asked.extend)
-    monkeypatch.setattr(pointers, "_trials", {})
-    KernelTrial(TrialSpec.from_names("pendulum", "d_optimal")).advance(1)
-    assert set(asked) == {
-        "dopt.kernel.loop.advance",
-        "dopt.kernel.held.hold",
-        "dopt.kernel.loop.keep_input",
-        "dopt.kernel.loop.note_nothing",
-        "dopt.kernel.loop.keep_state",
-        "dopt.kernel.integration.observe_euler",
-        "dopt.kernel.policies.plan_d_optimal",
-        "dopt.kernel.learners.learn_newest",
-        "dopt.kernel.information.add_network_rows",
-        "dopt.kernel.information.network_forms",
-    }
-    assert set(asked) <= {*kernel_parts(everything=True)}
+    program = """
+from dopt.kernel.cache import compile_missing, missing
+from dopt.kernel.information import add_nothing
+from dopt.kernel.pointers import compile_form
+from dopt.kernel.run import KernelTrial
+from dopt.spec.trial import TrialSpec
+part = "dopt.kernel.information.add_nothing"
+assert missing([part]) == [part]
+compile_missing([part])
+trial = KernelTrial(TrialSpec.from_names("pendulum", "random")).trial
+compile_form(trial, "add_rows", add_nothing)
+print(sum(add_nothing.stats.cache_hits.values()), sum(add_nothing.stats.cache_misses.values()))
+"""
+    assert printed(program, DOPT_CACHE=cache_without(tmp_path, "*add_nothing*")) == "1 0\n"
 
 
 GRID = {
@@ -173,7 +147,7 @@ GRID = {
 
 
 @pytest.mark.parametrize("name", GRID)
-def test_a_grid_compiles_what_its_trials_ask_for_and_no_more(
+def test_a_grid_compiles_what_its_trials_ask_for(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """A part that were missing would be compiled while the workers wait for it."""
@@ -185,113 +159,82 @@ def test_a_grid_compiles_what_its_trials_ask_for_and_no_more(
         trial_in_kernel(spec).advance(1)
     systems = {name_of_equations(spec.system) for spec in specs}
     assert {*needed_parts(spec.config for spec in specs)} == {*asked} | systems
+    assert {*asked} <= {*kernel_parts(everything=True)}
 
 
 def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: Path) -> None:
-    program = (
-        "import sys\n"
-        "from dopt.kernel import compiling\n"
-        "from dopt.spec.trial import TrialSpec\n"
-        "system = {'name': 'mass_spring', 'horizon': int(sys.argv[1])}\n"
-        "with compiling([TrialSpec.from_names(system, 'random').config]):\n"
-        "    print('numba' in sys.modules)\n"
-    )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
-    answers = [
-        subprocess.run(
-            [sys.executable, "-c", program, horizon],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for horizon in ("100", "200")
-    ]
+    program = """
+import sys
+from dopt.kernel import compiling
+from dopt.spec.trial import TrialSpec
+system = {"name": "mass_spring", "horizon": int(sys.argv[1])}
+with compiling([TrialSpec.from_names(system, "random").config]):
+    print("numba" in sys.modules)
+"""
+    folder = cache_without(tmp_path, "kinds-*")
+    answers = [printed(program, horizon, DOPT_CACHE=folder) for horizon in ("100", "200")]
     assert answers == ["True\n", "False\n"]
-
-
-def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the processor has the same name and offers less, as in a virtual machine."""
-
-    class Less(dict[str, bool]):
-        def flatten(self) -> str:
-            return "-avx2"
-
-    here = cache._source_digest()
-    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", Less)
-    assert cache._source_digest() != here
 
 
 def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
     """The same sources in another folder: nothing is compiled, and the numbers are the same."""
-    program = (
-        "import numpy as np\n"
-        "from dopt.kernel.equations import compiled_equations\n"
-        "from dopt.kernel.network import tanh\n"
-        "from dopt.systems import SYSTEMS\n"
-        "function = compiled_equations(SYSTEMS['pendulum']()).accelerations\n"
-        "out = np.empty(1)\n"
-        "function(np.ones(2), np.array(SYSTEMS['pendulum']().parameters), out)\n"
-        "print(sum(function.stats.cache_misses.values()), out[0].hex())\n"
-    )
+    program = """
+import numpy as np
+from dopt.kernel.equations import compiled_equations
+from dopt.systems import SYSTEMS
+function = compiled_equations(SYSTEMS["pendulum"]()).accelerations
+out = np.empty(1)
+function(np.ones(2), np.array(SYSTEMS["pendulum"]().parameters), out)
+print(sum(function.stats.cache_misses.values()), out[0].hex())
+"""
     shutil.copytree(ROOT / "dopt", tmp_path / "elsewhere/dopt")
-    answers = []
-    for checkout in (ROOT, tmp_path / "elsewhere"):
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            env=os.environ | {"DOPT_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(checkout)},
-            cwd=checkout,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        answers.append((done.stdout.split(), "compiling" in done.stderr))
-    (first, compiling), (second, again) = answers
-    assert (first[0], compiling) == ("1", True)
-    assert (second[0], again) == ("0", False)
-    assert first[1] == second[1]
+    folder = str(tmp_path / "cache")
+    (missed, number), (again, same) = (
+        printed(program, folder=one, DOPT_CACHE=folder, PYTHONPATH=str(one)).split()
+        for one in (ROOT, tmp_path / "elsewhere")
+    )
+    assert (missed, again) == ("1", "0")
+    assert number == same
 
 
 def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_path: Path) -> None:
     """Whoever opened the second would compile its argument, without what its module prepares."""
     (tmp_path / "pair.py").write_text(
-        "from pathlib import Path\n"
-        "from dopt.kernel import compiler\n"
-        "compiler._PACKAGE = Path(__file__).parent\n"
-        "from dopt.kernel.compiler import compiled\n"
-        "@compiled\n"
-        "def inner(x):\n"
-        "    return x + 1.0\n"
-        "@compiled\n"
-        "def outer(x):\n"
-        "    return 2.0 * inner(x)\n"
-        "@compiled\n"
-        "def applied(functions, x):\n"
-        "    return 2.0 * functions[0](x)\n"
-        "assert outer(1.0) == applied((inner,), 1.0) == 4.0\n"
+        """
+from pathlib import Path
+from dopt.kernel import compiler
+compiler._PACKAGE = Path(__file__).parent
+from dopt.kernel.compiler import compiled
+@compiled
+def inner(x):
+    return x + 1.0
+@compiled
+def outer(x):
+    return 2.0 * inner(x)
+@compiled
+def applied(functions, x):
+    return 2.0 * functions[0](x)
+assert outer(1.0) == applied((inner,), 1.0) == 4.0
+"""
     )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, tmp_path / "pair.py"], check=True, env=environment)
+    printed("import pair", folder=tmp_path, DOPT_CACHE=str(tmp_path / "cache"))
     found = [path.name.partition("-")[0] for path in tmp_path.rglob("*.nbi")]
     assert found == ["pair.outer"]
 
 
 def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path: Path) -> None:
     """And is gone with the process that made it."""
-    program = (
-        "import subprocess, sys\n"
-        "from dopt.kernel.cache import CACHE_FOLDER\n"
-        "print(CACHE_FOLDER)\n"
-        "if len(sys.argv) < 2:\n"
-        "    subprocess.run([sys.executable, __file__, 'child'], check=True)\n"
-        "print(CACHE_FOLDER.is_dir())\n"
-    )
-    (tmp_path / "program.py").write_text(program)
+    program = """
+import subprocess, sys
+from dopt.kernel.cache import CACHE_FOLDER
+print(CACHE_FOLDER, flush=True)
+if len(sys.argv) < 3:
+    subprocess.run([sys.executable, "-c", sys.argv[1], sys.argv[1], "child"], check=True)
+print(CACHE_FOLDER.is_dir())
+"""
     (tmp_path / "file").touch()
-    given = {**os.environ, "PYTHONPATH": str(ROOT), "DOPT_CACHE": str(tmp_path / "file" / "cache")}
-    command = [sys.executable, "-u", str(tmp_path / "program.py")]
-    done = subprocess.run(command, env=given, check=True, capture_output=True, text=True)
-    made, used, there, still_there = done.stdout.split()
+    said = printed(program, program, DOPT_CACHE=str(tmp_path / "file" / "cache"))
+    made, used, there, still_there = said.split()
     assert (made, there, still_there) == (used, "True", "True")
     assert not Path(made).exists()
 
@@ -332,14 +275,11 @@ def test_a_constant_from_elsewhere_is_part_of_the_content(tmp_path: Path, value:
     assert other not in (None, usual)
 
 
-def test_what_cannot_be_told_is_not_kept(tmp_path: Path) -> None:
+def test_what_cannot_be_told_or_has_no_file_is_not_kept(tmp_path: Path) -> None:
     from tests.dopt import trials
 
     for value in ([1.0], {"a": 1}, trials, trials.trial, object()):
         assert content_digest(function_with(tmp_path, FACTOR=value)) is None
-
-
-def test_a_function_without_a_file_is_not_kept() -> None:
     names: dict[str, types.FunctionType] = {}
     exec("def plan(x, out):\n    out[0] = x\n", names)
     assert content_digest(names["plan"]) is None
@@ -358,55 +298,22 @@ class NewLearner(Learner):
     kernel_function: ClassVar[str] = "dopt.kernel.learners.forgotten"
 
 
-@dataclass(frozen=True, kw_only=True)
-class NewModel(Model):
-    name: ClassVar[str] = "new"
-    compiled: ClassVar[bool] = True
-
-    def n_parameters(self, system: object) -> int:  # noqa: ARG002
-        return 1
-
-    def initial_parameters(self, system: object, rng: object) -> np.ndarray:  # noqa: ARG002
-        return np.zeros(1)
-
-    def predict_at(self, system: object, parameters: object, points: np.ndarray) -> np.ndarray:  # noqa: ARG002
-        return points
-
-
-@dataclass(frozen=True, kw_only=True)
-class NewSearch(Search):
-    name: ClassVar[str] = "new"
-
-    @property
-    def score(self) -> str:
-        return "juint"
-
-
 @pytest.mark.parametrize("part", [NewPolicy(), NewLearner()])
 def test_a_kernel_function_that_does_not_exist_is_named(part: ClosedLoop | Learner) -> None:
     with pytest.raises(SpecificationError, match="'new' names the kernel function"):
         function_of(part, None)
 
 
-def test_a_model_that_the_kernel_does_not_know_is_refused() -> None:
-    with pytest.raises(SpecificationError, match="model 'new' says that it is compiled"):
-        network_of(SYSTEMS["pendulum"](), NewModel())
-
-
-def test_an_unknown_score_is_refused() -> None:
-    with pytest.raises(SpecificationError, match=r"score of policy 'new'.*joint"):
-        score_code(NewSearch())
+def test_a_model_that_the_kernel_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(KINDS, RFF)
+    with pytest.raises(SpecificationError, match="model 'rff' says that it is compiled"):
+        network_of(SYSTEMS["pendulum"](), RFF())
 
 
 def test_every_score_has_a_name_and_each_policy_that_searches_one_of_them() -> None:
     assert list(SCORES.values()) == list(Score)
     searching = [cls() for cls in POLICIES.values() if issubclass(cls, Search)]
     assert {score_code(policy) for policy in searching} >= set(Score) - {Score.JOINT}
-
-
-@pytest.mark.parametrize(("steps", "switch"), [(1, 1), (2, 1), (5, 2), (6, 3)])
-def test_plans_switch_half_way(steps: int, switch: int) -> None:
-    assert switch_step(steps) == switch
 
 
 NETWORK = {"name": "mlp", "width": 3, "depth": 1}
@@ -425,9 +332,9 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 assert not isinstance(loop.advance, Dispatcher)
 found = []
-for mapping in json.load(sys.stdin):
+for mapping in json.loads(sys.argv[1]):
     result = run_trial(TrialSpec.from_mapping(mapping))
-    found.append({name: getattr(result, name).tolist() for name in sys.argv[1:]})
+    found.append({name: getattr(result, name).tolist() for name in sys.argv[2:]})
 print(json.dumps(found))
 """
 EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
@@ -437,16 +344,9 @@ EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
 @pytest.fixture(scope="module")
 def plain() -> list[dict[str, Any]]:
     given = json.dumps([spec.to_mapping() for spec in TRIALS])
-    done = subprocess.run(
-        [sys.executable, "-c", PLAIN_PROGRAM, *EXACT, *SINGLE],
-        input=given,
-        env=os.environ | {"DOPT_PLAIN": "1"},
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
+    found: list[dict[str, Any]] = json.loads(
+        printed(PLAIN_PROGRAM, given, *EXACT, *SINGLE, DOPT_PLAIN="1")
     )
-    found: list[dict[str, Any]] = json.loads(done.stdout)
     return found
 
 

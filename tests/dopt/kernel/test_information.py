@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.func import jacrev, vmap
 
-from dopt.assessment import model_forecast
 from dopt.errors import IncompatibleError
 from dopt.kernel.learners import filter_step, whiten
 from dopt.kernel.linear_algebra import dense, initial_covariance
@@ -29,7 +28,7 @@ from dopt.spec.config import FORM_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.dopt.custom_networks import model_of_one
-from tests.dopt.kernel.twin import interpreted, observed, run
+from tests.dopt.kernel.twin import check_inverse, interpreted, observed, run
 from tests.dopt.trials import trial
 
 
@@ -47,8 +46,7 @@ def test_it_is_the_inverse_of_the_sum_of_all_rows(env: str, policy: str) -> None
     parameters = run(fast, 37)
     J = jacobians(spec, parameters, fast.record.states[:-1]).reshape(-1, parameters.shape[1])
     M = 1e-2 * np.eye(J.shape[1]) + J.T @ J
-    product = dense(fast.state.covariance) @ M
-    np.testing.assert_allclose(product, np.eye(len(M)), rtol=0.0, atol=1e-9)
+    check_inverse(fast, M, 1e-9)
 
 
 FRESH = {"information": "fresh"}
@@ -80,10 +78,8 @@ class Numbered(CompiledPolicy, InformationPolicy):
 
 def rows(spec: TrialSpec, theta: Array, states: Array) -> Array:
     """Return J of all states, (n r, q)."""
-    model = model_of_one(spec.system, spec.model)
-    over_states = vmap(jacrev(model), in_dims=(None, 0))
-    J: Array = over_states(torch.tensor(theta), torch.tensor(states)).flatten(0, 1).numpy()
-    return J
+    repeated = np.tile(theta, (len(states), 1))
+    return jacobians(spec, repeated, states).reshape(-1, len(theta))
 
 
 def advanced(steps: int, policy: dict[str, Any], env: str = "arm") -> KernelTrial:
@@ -102,18 +98,11 @@ def summed(fast: KernelTrial, last: int) -> Array:
     return M
 
 
-def check_inverse(fast: KernelTrial, M: Array) -> None:
-    """Check that a trial holds M⁻¹ up to rounding."""
-    np.testing.assert_allclose(
-        dense(fast.state.covariance) @ M, np.eye(len(M)), rtol=0.0, atol=1e-13 * np.linalg.cond(M)
-    )
-
-
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
 def test_the_matrix_is_that_of_all_states_at_the_present_parameters(env: str) -> None:
     fast = advanced(25, FRESH, env)
     M = summed(fast, 25)
-    check_inverse(fast, M)
+    check_inverse(fast, M, 1e-13 * np.linalg.cond(M))
     old = advanced(25, {"information": "accumulated"}, env)
     assert not np.allclose(np.linalg.inv(dense(old.state.covariance)), M, rtol=0.1)
 
@@ -125,8 +114,9 @@ def test_between_two_sums_the_newest_rows_are_added() -> None:
         newest = advanced(steps, policy)
         J = rows(newest.spec, newest.state.theta, newest.record.states[steps - 1 : steps])
         M = M + J.T @ J
-        check_inverse(newest, M)
-    check_inverse(advanced(28, policy), summed(advanced(28, policy), 28))
+        check_inverse(newest, M, 1e-13 * np.linalg.cond(M))
+    M = summed(advanced(28, policy), 28)
+    check_inverse(advanced(28, policy), M, 1e-13 * np.linalg.cond(M))
 
 
 @pytest.mark.parametrize("policy", NETWORK_POLICIES)
@@ -165,51 +155,62 @@ def test_stored_trials_keep_their_keys() -> None:
         assert TrialSpec.from_mapping(spec.to_mapping()) == spec
 
 
-@pytest.mark.parametrize("form", ["dual", "sketch"])
-def test_it_needs_the_primal_form(form: str) -> None:
-    with pytest.raises(IncompatibleError, match=r"policy.information 'fresh' goes with policy"):
-        trial("arm", "d_optimal", policy=FRESH | {"form": form})
+LEAST_SQUARES = {"learner": {"name": "recursive_least_squares"}}
+OTHER_MODEL = r"goes with model 'mlp', 'affine', 'black_box' or 'grey_box', but model '{}'"
+
+
+def with_learner(name: str) -> dict[str, Any]:
+    """Return the sections of a trial with a learner that updates the matrix."""
+    cls = LEARNERS[name]
+    model = {"name": "mlp" if cls.structure == "gradient" else "linear"}
+    sections: dict[str, Any] = {"policy": FRESH, "learner": {"name": name}, "model": model}
+    if cls.estimates_states:
+        sections["env"] = {"measured_states": [0], "measurement_noise": [0.1]}
+        sections["policy"] = FRESH | {"regularization": 3.0}
+    return sections
 
 
 @pytest.mark.parametrize(
-    "learner", [name for name, one in LEARNERS.items() if one.updates_information]
+    ("env", "sections", "said"),
+    [
+        *(
+            (
+                "arm",
+                {"policy": FRESH | {"form": form}},
+                "policy.information 'fresh' goes with policy",
+            )
+            for form in ("dual", "sketch")
+        ),
+        *(
+            ("arm", with_learner(name), r"^policy.information 'fresh' goes with .*: change")
+            for name, learner in LEARNERS.items()
+            if learner.updates_information
+        ),
+        *(
+            (
+                env,
+                {"policy": FRESH, "model": {"name": model}} | LEAST_SQUARES,
+                OTHER_MODEL.format(model),
+            )
+            for env, model in (("arm", "linear"), ("mass_spring", "linear_state"), ("arm", "rff"))
+        ),
+        ("arm", {"policy": {"refresh_every": 2}}, "policy.refresh_every 2 goes with policy.inform"),
+    ],
 )
-def test_a_learner_that_updates_the_matrix_decides_about_it(learner: str) -> None:
-    model = {"name": "mlp" if LEARNERS[learner].structure == "gradient" else "linear"}
-    estimates = LEARNERS[learner].estimates_states
-    env = {"measured_states": [0], "measurement_noise": [0.1]} if estimates else {}
-    policy = FRESH | ({"regularization": 3.0} if estimates else {})
-    with pytest.raises(
-        IncompatibleError, match=r"^policy.information 'fresh' goes with .*: change"
-    ):
-        trial("arm", "d_optimal", policy=policy, learner={"name": learner}, model=model, env=env)
+def test_fresh_information_needs_a_primal_matrix_of_its_own(
+    env: str, sections: Any, said: str
+) -> None:
+    with pytest.raises(IncompatibleError, match=said):
+        trial(env, "d_optimal", **sections)
 
 
-@pytest.mark.parametrize("model", ["linear", "linear_state", "rff"])
-def test_it_is_refused_where_it_would_be_the_accumulated_one(model: str) -> None:
-    least_squares = {"name": "recursive_least_squares"}
-    with pytest.raises(
-        IncompatibleError,
-        match=rf"goes with model 'mlp', 'affine', 'black_box' or 'grey_box', but model '{model}'",
-    ):
-        trial(
-            "mass_spring" if model == "linear_state" else "arm",
-            "d_optimal",
-            policy=FRESH,
-            model={"name": model},
-            learner=least_squares,
-        )
-
-
-def test_a_count_of_steps_says_nothing_without_it() -> None:
-    with pytest.raises(IncompatibleError, match=r"policy.refresh_every 2 goes with policy.inform"):
-        trial("arm", "d_optimal", policy={"refresh_every": 2})
-
-
-def test_a_wide_network_holds_it_in_the_primal_form() -> None:
+def test_fresh_information_and_filters_are_primal_at_any_size() -> None:
     wide = trial("arm", "d_optimal", policy=FRESH, model={"width": 64})
     assert wide.policy.chosen_form(10_000, 60) == "primal"  # type: ignore[attr-defined]
     assert trial("arm", "d_optimal").policy.chosen_form(10_000, 60) == "dual"  # type: ignore[attr-defined]
+    spec = trial("arm", "d_optimal", learner=EKF, model={"width": 30}, env={"horizon": 3})
+    assert KernelTrial(spec).state.covariance.size == 1202
+    assert spec.config.memory > 2 * 8 * 1202**2
 
 
 def test_auto_takes_no_form_that_is_too_large_and_the_key_says_so() -> None:
@@ -235,18 +236,11 @@ def own(**fields: object) -> TrialSpec:
     return TrialSpec.from_mapping({**mapping, "policy": given})
 
 
-def test_the_numbers_of_a_users_compiled_policy_keep_their_places() -> None:
-    for fields in ({}, FRESH, FRESH | {"refresh_every": 3}):
-        spec = own(**fields)
-        assert spec.policy.kernel_numbers(10, 1.0) == (1e-3, 0.25)
-        result = run_trial(spec)
-        assert result.inputs[1:] == pytest.approx(0.25 * spec.system.gamma)
-
-
 def test_a_users_compiled_policy_has_fresh_information() -> None:
     fast = KernelTrial(own(information="fresh"))
     fast.advance(12)
-    check_inverse(fast, summed(fast, 12))
+    M = summed(fast, 12)
+    check_inverse(fast, M, 1e-13 * np.linalg.cond(M))
     with pytest.raises(IncompatibleError, match=r"'fresh' goes with policy.form 'primal'"):
         own(information="fresh", form="dual")
 
@@ -304,7 +298,7 @@ def test_an_underweighted_sample_has_the_variance_of_its_prediction_as_well() ->
         step = gain @ residual
         assert parameters[t + 1] - parameters[t] == pytest.approx(step, rel=1e-5, abs=1e-7)
         M = M + rows.T @ np.linalg.solve(0.1 * np.eye(2) + 2.0 * predicted, rows)
-    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-7)
+    check_inverse(fast, M, 1e-7)
 
 
 @given(st.integers(0, 1000), st.floats(0.01, 20.0), st.floats(1e-3, 10.0), st.floats(1e-6, 1e6))
@@ -340,7 +334,7 @@ def test_what_fades_is_the_information_and_never_the_prior(forgetting: float, po
         for i in range(t * k, (t + 1) * k):
             M[i % len(M), i % len(M)] += weight
         assert np.linalg.eigvalsh(M)[0] >= 0.5 * regularization * (1 - 1e-9)
-    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-7)
+    check_inverse(fast, M, 1e-7)
 
 
 @given(st.integers(1, 400), st.floats(0.01, 0.9999), st.floats(1e-6, 1.0))
@@ -348,23 +342,13 @@ def test_the_renewal_holds_every_entry_between_half_and_twice_the_prior(
     n: int, forgetting: float, regularization: float
 ) -> None:
     k, weight = ExtendedKalman(forgetting=forgetting).renewal(n, regularization)
+    assert ExtendedKalman().renewal(n, regularization) == (0, 0.0)  # which forgets nothing
     diagonal = np.full(n, regularization)
     for t in range(min(3 * -(-n // k), 2_000)):
         diagonal *= forgetting
         np.add.at(diagonal, np.arange(t * k, (t + 1) * k) % n, weight)
         assert diagonal.min() >= 0.5 * regularization * (1 - 1e-9)
         assert diagonal.max() <= 2.0 * regularization
-
-
-def test_a_filter_that_forgets_nothing_renews_nothing() -> None:
-    assert ExtendedKalman().renewal(353, 1.0) == (0, 0.0)
-
-
-def test_auto_is_primal_for_a_filter_of_any_size() -> None:
-    spec = trial("arm", "d_optimal", learner=EKF, model={"width": 30}, env={"horizon": 3})
-    fast = KernelTrial(spec)
-    assert fast.state.covariance.size == 1202
-    assert spec.config.memory > 2 * 8 * 1202**2
 
 
 def process(env: str, seed: int = 3, /, **fields: Any) -> TrialSpec:
@@ -398,14 +382,3 @@ def test_the_growing_factor_is_that_of_a_fresh_factorisation(
     factor = np.tril(fast.state.posterior.factors[0])
     np.testing.assert_allclose(factor, np.linalg.cholesky(K), rtol=0.0, atol=1e-8 * amplitude)
     np.testing.assert_allclose(factor @ factor.T, K, rtol=0.0, atol=1e-12 * amplitude**2)
-
-
-def test_an_assessment_predicts_with_the_process() -> None:
-    spec = process("arm", env={"horizon": 20})
-    parameters, rng = run_trial(spec).parameters, np.random.default_rng(1)
-    x = rng.normal(size=(5, spec.system.n_states))
-    u = rng.normal(size=(5, 1, spec.system.n_inputs))
-    flow = np.stack(spec.system.known(tuple(x.T), tuple(u[:, 0].T), spec.system.parameters))
-    flow[list(spec.system.learned_rows)] += spec.model.predict(spec.system, parameters, x).T
-    following = model_forecast(spec.system, spec.model, parameters)(x, u)[0]
-    assert following == pytest.approx(x + spec.system.dt * flow.T, rel=1e-12)

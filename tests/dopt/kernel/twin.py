@@ -10,6 +10,7 @@ from numba import float64, int64
 from numba.core.dispatcher import Dispatcher
 
 from dopt.kernel.held import HeldTrial, trial_in
+from dopt.kernel.linear_algebra import dense
 from dopt.kernel.loop import advance
 from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
 from dopt.kernel.run import KernelSteps, KernelTrial, NumpyParts
@@ -33,6 +34,12 @@ def observed(trial: KernelTrial, t: int) -> Array:
 def relative_gap(values: Array, expected: Array) -> float:
     """Return the largest difference between two arrays beside the largest entry."""
     return float(np.abs(values - expected).max() / np.abs(expected).max())
+
+
+def check_inverse(trial: KernelTrial, M: Array, atol: float) -> None:
+    """Check that a trial holds M⁻¹ up to rounding."""
+    product = dense(trial.state.covariance) @ M
+    np.testing.assert_allclose(product, np.eye(len(M)), rtol=0.0, atol=atol)
 
 
 def call(function: CompiledFunction, *arguments: Any) -> Any:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from dopt.reference.batch import run_trials
 from dopt.spec.trial import TrialSpec
@@ -19,7 +18,10 @@ pytestmark = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="torch finds no CUDA device on this machine"
 )
 
-OWN = {"_target_": "tests.dopt.custom_networks.Stack"}
+OWN = {
+    "network": {"_target_": "tests.dopt.custom_networks.Stack"},
+    "residual": {"_target_": "tests.dopt.reference.test_reference.Residual"},
+}
 CASES: dict[str, TrialSpec] = {
     **{
         f"{env}-{policy}": trial(env, policy)
@@ -31,31 +33,22 @@ CASES: dict[str, TrialSpec] = {
     "newest": trial("cartpole", "d_optimal", learner={"name": "adam"}),
     "sketch": trial("arm", "d_optimal", policy={"form": "sketch", "sketch_size": 48}),
     "runge_kutta": trial("pendulum", "d_optimal", env={"integrator": "rk4"}),
-    "network": TrialSpec.from_mapping(
-        trial("arm", "d_optimal").to_mapping() | {"model": OWN, "path": None}
-    ),
+    **{
+        name: TrialSpec.from_mapping(
+            trial("arm", "d_optimal").to_mapping() | {"model": model, "path": None}
+        )
+        for name, model in OWN.items()
+    },
     "numpy": trial("arm", "space_filling"),
 }
 
 
-def check_alike(spec: TrialSpec, module: nn.Module | None = None) -> None:
+@pytest.mark.parametrize("name", CASES)
+def test_every_choice_runs_on_a_gpu(name: str) -> None:
     """Run two trials on the GPU and on the CPU, and compare what was applied, seen and learned."""
+    spec = CASES[name]
     specs = [spec, spec.with_seed(spec.seed + 1)]
-    on_gpu = run_trials(specs, "cuda", module)
-    for gpu, cpu in zip(on_gpu, run_trials(specs, module=module), strict=True):
+    for gpu, cpu in zip(run_trials(specs, "cuda"), run_trials(specs), strict=True):
         for part in ("inputs", "states", "loss", "parameters"):
             assert relative_gap(getattr(gpu, part), getattr(cpu, part)) < 1e-7, part
         assert np.isfinite(gpu.plan_us).all()
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_every_choice_runs_on_a_gpu(name: str) -> None:
-    check_alike(CASES[name])
-
-
-def test_a_module_on_the_cpu_is_explored_on_a_gpu() -> None:
-    torch.manual_seed(0)
-    spec = trial("arm", "d_optimal", env={"horizon": 20})
-    n_in, n_out = len(spec.system.features), spec.system.n_learned
-    layers = nn.Linear(n_in, 8), nn.LayerNorm(8), nn.GELU(), nn.Linear(8, n_out)
-    check_alike(spec, nn.Sequential(*layers).double())

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import pickle
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
-from torch.func import jacrev, vmap
+from torch import nn
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.models import MLP
@@ -21,138 +19,15 @@ from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.models import (
     SMALL,
     BatchInformation,
-    BatchModel,
-    d_optimal_inputs,
     gradients_and_changes,
     jacobian,
-    model_function,
     network_function,
-    planning_columns,
-    quadratic_problem,
 )
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.custom_networks import Stack, for_one
-from tests.dopt.trials import PAIRS, SMALL_SEARCHES, trial
-
-
-class Situation(NamedTuple):
-    """What a plan is made from, for one trial."""
-
-    model: BatchModel
-    theta: Tensor  # (q,)
-    state: Tensor  # (d,)
-    information: Tensor  # (q, q)
-
-
-@functools.cache
-def situation(
-    spec: TrialSpec, seed: int, seen: int = 20, regularization: float = 1e-2
-) -> Situation:
-    """Return a situation after some states have been seen, for the model of a trial."""
-    rng = torch.Generator().manual_seed(seed)
-    system = spec.system
-    model = model_function(system, spec.model)
-    theta = torch.tensor(draw(spec.with_seed(seed)).weights)
-    theta = theta + 0.1 * torch.rand(theta.shape, generator=rng, dtype=torch.float64)
-    widths = torch.ones(system.n_states, dtype=torch.float64)
-    widths[list(system.grid_indices)] = torch.tensor(system.grid_half_widths, dtype=torch.float64)
-    states = widths * (2 * torch.rand(seen + 1, system.n_states, generator=rng).double() - 1)
-    M = regularization * torch.eye(len(theta), dtype=torch.float64)
-    if seen:
-        J = vmap(jacrev(for_one(model)), (None, 0))(theta, states[1:]).flatten(0, 1)
-        M = M + J.mT @ J
-    return Situation(model, theta, states[0], M)
-
-
-def step_from(spec: TrialSpec, now: Situation, u: Tensor) -> Tensor:
-    """Return x(u) = x + dt f_θ(x, u), by the system's own equations, (d,)."""
-    system = spec.system
-    known = system.known(tuple(now.state), tuple(u), system.parameters)
-    flow = torch.stack([torch.as_tensor(value, dtype=torch.float64) for value in known])
-    rows = torch.zeros(system.n_states, system.n_learned, dtype=torch.float64)
-    for k, row in enumerate(system.learned_rows):
-        rows[row, k] = 1.0
-    return now.state + system.dt * (flow + rows @ for_one(now.model)(now.theta, now.state))
-
-
-def circle(radius: float, points: int) -> Tensor:
-    """Return points on a circle, (points, 2)."""
-    angles = torch.arange(points, dtype=torch.float64) * (2 * torch.pi / points)
-    return radius * torch.stack([angles.cos(), angles.sin()], dim=-1)
-
-
-def sphere(radius: float, dimensions: int) -> Tensor:
-    """Return points on a sphere, (points, dimensions): both, evenly spread, or random ones."""
-    if dimensions == 1:
-        return torch.tensor([[radius], [-radius]], dtype=torch.float64)
-    if dimensions == 2:
-        return circle(radius, 3_600)
-    rng = torch.Generator().manual_seed(0)
-    points = torch.randn(20_000, dimensions, generator=rng, dtype=torch.float64)
-    return radius * points / points.norm(dim=1, keepdim=True)
-
-
-CASES = [(env, policy) for env, policy in PAIRS if policy in ("d_optimal", "oracle")]
-
-
-def gradients(now: Situation, x: Tensor) -> Tensor:
-    """Return J = ∂a/∂θ at n states, (n, r, q)."""
-    return vmap(jacrev(for_one(now.model)), (None, 0))(now.theta, x)
-
-
-@functools.cache
-def pieces(spec: TrialSpec, seed: int) -> tuple[Tensor, Tensor]:
-    """Return J, (r, q), and D B, (r, q, m), at x̄, both of D and B by central differences."""
-    system, now = spec.system, situation(spec, seed)
-    zero = torch.zeros(system.n_inputs, dtype=torch.float64)
-    bar = step_from(spec, now, zero)
-    at_bar = now._replace(state=bar)
-    B = torch.stack(
-        [(step_from(spec, at_bar, e) - step_from(spec, at_bar, -e)) / 2 for e in _axes(zero)], dim=1
-    )
-    step = 1e-5
-    moved = step * _axes(bar)
-    D = (gradients(now, bar + moved) - gradients(now, bar - moved)) / (2 * step)
-    return gradients(now, bar[None])[0], D.permute(1, 2, 0) @ B
-
-
-def _axes(like: Tensor) -> Tensor:
-    return torch.eye(len(like), dtype=torch.float64)
-
-
-class Solved(BatchInformation):
-    """Matrices, (n, s, s), with which systems of equations are solved as they are."""
-
-    def __init__(self, matrices: Tensor) -> None:
-        self._matrices = matrices
-
-    def solve(self, columns: Tensor) -> Tensor:
-        return torch.linalg.solve(self._matrices, columns)
-
-
-def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return Q, v and the chosen input of the reference."""
-    given = now.theta[None], now.state[None], torch.tensor([component])
-    columns = planning_columns(spec.system, now.model, *given)
-    problem = quadratic_problem(columns, Solved(now.information[None]))
-    ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
-    u = d_optimal_inputs(problem, spec.system.gamma, ties)
-    return problem.Q[0], problem.v[0], u[0]
-
-
-@pytest.mark.parametrize(("env", "policy"), CASES)
-def test_the_problem_is_made_of_finite_differences_of_the_gradient(env: str, policy: str) -> None:
-    spec = trial(env, policy)
-    now = situation(spec, 0)
-    inverse = torch.linalg.inv(now.information)
-    for component, (g, DB) in enumerate(zip(*pieces(spec, 0), strict=True)):
-        Q, v, _ = solve(spec, now, component)
-        # Difference quotients of |v| v and of products lose half of the digits.
-        scale = float((DB.mT @ inverse @ DB).abs().max() + (DB.mT @ inverse @ g).abs().max())
-        assert torch.allclose(Q, DB.mT @ inverse @ DB, rtol=0.0, atol=1e-6 * scale)
-        assert torch.allclose(v, -DB.mT @ inverse @ g, rtol=0.0, atol=1e-6 * scale)
+from tests.dopt.custom_networks import Stack
+from tests.dopt.trials import PAIRS, SMALL_SEARCHES, covering, trial
 
 
 def test_a_model_whose_slope_is_free_of_its_parameters_does_not_change_its_gradient() -> None:
@@ -283,20 +158,6 @@ def test_a_network_predicts_what_the_shipped_one_does(env: str) -> None:
     np.testing.assert_allclose(predicted, expected, rtol=1e-12, atol=1e-14)
 
 
-@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
-@torch.no_grad()
-def test_a_trial_with_it_is_that_of_the_shipped_network(policy: str) -> None:
-    spec = specification(policy=policy)
-    shipped = TrialSpec.from_mapping(spec.to_mapping() | {"model": {"name": "mlp"}})
-    batch, own = Lockstep([shipped]), run_trial(spec)
-    batch.theta.copy_(Lockstep([spec]).theta)
-    for t in range(spec.system.horizon):
-        batch.step(t)
-    np.testing.assert_allclose(own.states, batch.states[0].numpy(), rtol=1e-9)
-    np.testing.assert_allclose(own.loss, batch.columns["loss"][0], rtol=1e-9)
-    assert own.loss[-1] < own.loss[0]
-
-
 @pytest.mark.parametrize("policy", POLICIES)
 def test_every_policy_runs_with_it_or_says_why_not(policy: str) -> None:
     mapping = specification(policy="random", width=4).to_mapping()
@@ -321,12 +182,6 @@ def test_the_seed_alone_gives_the_initial_parameters() -> None:
     assert torch.equal(torch.rand(1), expected), "torch's own generator was touched"
     assert torch.equal(first, second)
     assert not torch.equal(first, Lockstep([specification(seed=1)]).theta)
-
-
-def test_a_batch_holds_networks_with_initial_parameters_of_their_own() -> None:
-    specs = [specification(seed=seed) for seed in range(2)]
-    for together, spec in zip(run_trials(specs), specs, strict=True):
-        np.testing.assert_allclose(together.states, run_trial(spec).states, rtol=1e-9)
 
 
 def test_the_trial_comes_back_from_its_mapping_and_from_another_process() -> None:
@@ -359,3 +214,55 @@ def test_a_wrong_network_is_refused_in_a_sentence(
     with pytest.raises(SpecificationError, match=sentence) as caught:
         specification(target, **arguments)
     assert "model." in str(caught.value)
+
+
+class Residual(nn.Module):
+    """A network of another kind: GELU units with a skip connection and a layer norm."""
+
+    def __init__(self, n_in: int, n_out: int) -> None:
+        super().__init__()
+        self.lift = nn.Linear(n_in, 8, dtype=torch.float64)
+        self.block = nn.Sequential(
+            nn.LayerNorm(8, dtype=torch.float64), nn.Linear(8, 8, dtype=torch.float64), nn.GELU()
+        )
+        self.out = nn.Linear(8, n_out, dtype=torch.float64)
+
+    def forward(self, phi: torch.Tensor) -> torch.Tensor:
+        h = torch.relu(self.lift(phi))
+        result: torch.Tensor = self.out(h + self.block(h))
+        return result
+
+
+LOCKSTEP = [pair for pair in PAIRS if pair[1] in ("random", "uniform", "d_optimal", "oracle")]
+
+
+@pytest.mark.parametrize(("env", "policy"), sorted({*covering(LOCKSTEP), *LOCKSTEP[:8]}))
+def test_a_batch_is_its_trials_one_by_one(env: str, policy: str) -> None:
+    specs = [trial(env, policy, seed, env={"horizon": 5}) for seed in range(3)]
+    together = run_trials(specs)
+    for spec, many in zip(specs[1:], together[1:], strict=True):
+        one = run_trials([spec])[0]
+        gamma = spec.system.gamma
+        assert many.inputs == pytest.approx(one.inputs, rel=0.0, abs=1e-9 * gamma)
+        assert many.states == pytest.approx(one.states, rel=1e-9, abs=1e-9)
+        assert many.loss == pytest.approx(one.loss, rel=1e-9)
+        assert many.parameters == pytest.approx(one.parameters, rel=1e-6, abs=1e-9)
+
+
+def test_trials_of_two_configs_are_no_batch() -> None:
+    with pytest.raises(SpecificationError, match="may differ in the seed alone"):
+        run_trials([trial("arm", "random"), trial("arm", "uniform")])
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
+def test_any_module_is_explored(policy: str) -> None:
+    shipped = trial("arm", policy, env={"horizon": 25}, learner={"learning_rate": 2e-2})
+    own = {"_target_": f"{Residual.__module__}.Residual"}
+    spec = TrialSpec.from_mapping(shipped.to_mapping() | {"model": own, "path": None})
+    initial, result = draw(spec).weights, run_trials([spec])[0]
+    assert not result.diverged
+    assert result.parameters.shape == initial.shape
+    assert np.mean(result.parameters != initial) > 0.5  # units of a ReLU may be dead
+    norms = np.linalg.norm(result.inputs, axis=1)
+    if policy != "random":
+        assert norms == pytest.approx(spec.system.gamma)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -50,24 +49,31 @@ ARM = """
 LIMITS = "joints: {default: {velocity: 2, acceleration: 10}, turn: {velocity: 1.5}}"
 
 
+def body_of(text: str) -> Body:
+    return Body(mujoco.MjModel.from_xml_string(text))
+
+
+def limits_of(body: Body, folder: Path, text: str) -> Limits:
+    """Return the limits of a robot by the text of their file."""
+    (folder / "limits.yaml").write_text(text)
+    return Limits.of(body, folder / "limits.yaml")
+
+
 @pytest.fixture
-def arm(tmp_path: Path) -> Body:
-    (tmp_path / "arm.xml").write_text(ARM)
-    return Body.load(tmp_path / "arm.xml")
+def arm() -> Body:
+    return body_of(ARM)
 
 
 @pytest.fixture
 def limits(arm: Body, tmp_path: Path) -> Limits:
-    (tmp_path / "limits.yaml").write_text(LIMITS)
-    return Limits.of(arm, tmp_path / "limits.yaml")
+    return limits_of(arm, tmp_path, LIMITS)
 
 
 def jaco() -> Body:
-    spec = importlib.util.find_spec("dm_control")
-    if spec is None or not spec.submodule_search_locations:
-        pytest.skip("needs dm_control")
-    folder = Path(spec.submodule_search_locations[0])
-    return Body.load(folder / "third_party" / "kinova" / "jaco_arm.xml")
+    pytest.importorskip("dm_control", reason="needs dm_control")
+    from studies.robots import simulated
+
+    return simulated.jaco()[0]
 
 
 def random_motion(n: int, rows: int = 50) -> Motion:
@@ -93,6 +99,9 @@ def inverse(body: Body, motion: Motion, model: object = None) -> np.ndarray:
 
 
 def test_torques_are_those_of_the_engine(arm: Body) -> None:
+    assert arm.joints == ("turn", "slide", "lift", "roll")
+    assert arm.bodies == ("base", "link", "hand")
+    assert "joints without an actuator, which stay where the file puts them: 1" in arm.notes
     for body in (arm, jaco()):
         damping = body.model.dof_damping.copy()
         motion = random_motion(body.n)
@@ -103,14 +112,8 @@ def test_torques_are_those_of_the_engine(arm: Body) -> None:
         np.testing.assert_allclose(body.torques(motion), expected, atol=1e-12 * scale)
 
 
-def test_a_free_body_is_no_joint_and_a_note_says_so(arm: Body) -> None:
-    assert arm.joints == ("turn", "slide", "lift", "roll")
-    assert arm.bodies == ("base", "link", "hand")
-    assert "1 joints that no actuator drives stay where the file puts them" in arm.notes
-
-
 @pytest.mark.parametrize("name", ["mass", "com", "inertia", "armature", "damping"])
-def test_regressors_are_derivatives_of_the_torques_of_the_engine(
+def test_regressors_are_derivatives_of_the_engine_s_torques(
     arm: Body, limits: Limits, name: str
 ) -> None:
     unknowns = Unknowns(arm, limits, name)
@@ -169,31 +172,24 @@ def test_null_directions_change_no_torque_and_are_complete(arm: Body, limits: Li
     found = Identifiability.of(unknowns, motion, 500.0)
     rows = unknowns.regressor(motion).reshape(-1, len(unknowns))
     sizes = np.linalg.norm(rows, axis=0)
-    rows = rows[:, sizes > 1e-9 * sizes.max()]
-    rows /= np.linalg.norm(rows, axis=0)
+    rows = (rows / np.maximum(sizes, 1e-9 * sizes.max()))[:, sizes > 1e-9 * sizes.max()]
     rank = np.linalg.matrix_rank(rows, tol=1e-8 * np.linalg.norm(rows, 2))
     assert len(found.null) == len(unknowns) - rank > 0
 
 
 def test_known_null_directions_in_words(tmp_path: Path) -> None:
     """Of a single hinge under gravity: centre along the axis and two moments have no effect."""
-    (tmp_path / "one.xml").write_text(
+    body = body_of(
         """<mujoco><worldbody><body name="rod"><joint name="hinge" axis="0 1 0" range="-1 1"/>
         <inertial pos="0.3 0 0" mass="2" diaginertia="0.1 0.2 0.3"/></body></worldbody></mujoco>"""
     )
-    body = Body.load(tmp_path / "one.xml")
     given = "joints: {hinge: {velocity: 2, acceleration: 9, torque: 10}}"
-    (tmp_path / "limits.yaml").write_text(given)
-    limits = Limits.of(body, tmp_path / "limits.yaml")
+    limits = limits_of(body, tmp_path, given)
     unknowns = Unknowns(body, limits, "mass,com,inertia,armature")
     null = Identifiability.of(unknowns, random_motion(1, 200), 100.0).null
-    assert {text for text in null if "no effect" in text} == {
-        "com_y:rod has no effect",
-        "Ix:rod has no effect",
-        "Iz:rod has no effect",
-    }
-    pairs = [text for text in null if "no effect" not in text]
-    assert "Iy:rod − armature:hinge" in pairs
+    without = {f"{name}:rod has no effect" for name in ("com_y", "Ix", "Iz")}
+    assert {text for text in null if "no effect" in text} == without
+    assert "Iy:rod − armature:hinge" in null
     # m and c_x enter by m c_x and, with Iy, by the moment about the axis: one more.
     assert len(null) == 5
 
@@ -233,8 +229,8 @@ def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
     limits = Limits.of(Body.load(source))
     np.testing.assert_array_equal(limits.velocity, 10.0)
     said = " ".join(limits.notes)
-    assert "every joint has the velocity 10 rad/s, which looks like a default" in said
-    assert "every joint has the torque 300 N m, which looks like a default" in said
+    for size in ("velocity 10 rad/s", "torque 300 N m"):
+        assert f"every joint has the {size}, which looks like a default" in said
     assert "no acceleration is given" in said
 
 
@@ -248,13 +244,31 @@ def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
         ("joints: {lift: 3}", "lift in .* is 3, but a mapping"),
         ("[1, 2]", "has no mapping 'joints'"),
         ("joints: {lift: [", "cannot be read"),
-        ("joints: {lift: {velocity: 2}}", "joint 'turn' has no limit of its velocity"),
+        ("joints: {lift: {velocity: 2}}", "velocity of turn"),
     ],
 )
 def test_limits_that_are_wrong_are_named(arm: Body, tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / "limits.yaml").write_text(text)
     with pytest.raises(SpecificationError, match=said):
-        Limits.of(arm, tmp_path / "limits.yaml")
+        limits_of(arm, tmp_path, text)
+
+
+def test_missing_limits_are_named_at_once_with_the_lines_to_fill_in(arm: Body) -> None:
+    with pytest.raises(SpecificationError, match="velocity of turn and 3 more joints") as error:
+        Limits.of(arm)
+    lines = str(error.value).partition("\n")[2]
+    assert lines == "joints:\n  default: {velocity: …}"
+    arm.model.jnt_limited[arm.model.joint("slide").id] = 0
+    with pytest.raises(SpecificationError, match="position of slide; velocity of turn") as error:
+        Limits.of(arm)
+    lines = str(error.value).partition("\n")[2]
+    assert lines == "joints:\n  default: {velocity: …}\n  slide: {position: […, …]}"
+
+
+def test_a_slide_has_units_of_its_own(arm: Body, limits: Limits) -> None:
+    found = {one.name: one.unit for one in Unknowns(arm, limits, "all").parameters}
+    assert found["damping:slide"] == "N s/m" != found["damping:lift"] == "N m s/rad"
+    assert [found[f"{kind}:slide"] for kind in ("armature", "frictionloss")] == ["kg", "N"]
+    assert found["gear:slide"] == ""
 
 
 @pytest.mark.parametrize(
@@ -266,47 +280,44 @@ def test_limits_that_are_wrong_are_named(arm: Body, tmp_path: Path, text: str, s
         ("", "no unknown parameter is given"),
     ],
 )
-def test_parameters_that_are_wrong_are_named(
-    arm: Body, limits: Limits, wanted: str, said: str
-) -> None:
+def test_wrong_parameters_are_named(arm: Body, limits: Limits, wanted: str, said: str) -> None:
     with pytest.raises(SpecificationError, match=said):
         Unknowns(arm, limits, wanted)
 
 
-def test_files_that_are_no_robot_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "none.xml").write_text("<mujoco><worldbody/></mujoco>")
-    (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
-    for name, said in {
-        "none.xml": "no hinge or slide",
-        "bad.xml": "cannot be read",
-        "gone.xml": "gone.xml",
-    }.items():
-        with pytest.raises(SpecificationError, match=said):
-            Body.load(tmp_path / name)
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<mujoco><worldbody/></mujoco>", "no hinge or slide"),
+        ("<mujoco><worldbody>", "cannot be read"),
+        ("", "robot.xml"),
+    ],
+)
+def test_files_that_are_no_robot_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    if text:
+        (tmp_path / "robot.xml").write_text(text)
+    with pytest.raises(SpecificationError, match=said):
+        Body.load(tmp_path / "robot.xml")
 
 
-def test_collisions_are_found_and_contacts_at_home_are_not(tmp_path: Path) -> None:
-    source = tmp_path / "fold.xml"
-    source.write_text(
-        """<mujoco><worldbody><geom name="wall" type="plane" size="1 1 1"/>
-        <body name="arm" pos="0 0 0.5"><joint name="hinge" axis="0 1 0" range="-2 2"/>
-        <geom type="capsule" fromto="0 0 0 0.6 0 0" size="0.02"/></body></worldbody></mujoco>"""
-    )
-    body = Body.load(source)
-    touching = body.collisions(np.array([[0.0], [1.4], [-1.4]]))
+FOLD = """<mujoco><worldbody><geom name="wall" type="plane" size="1 1 1"/>
+    <body name="arm" pos="0 0 0.5"><joint name="hinge" axis="0 1 0" range="-2 2"/>
+    <geom type="capsule" fromto="0 0 0 0.6 0 0" size="0.02"/></body></worldbody></mujoco>"""
+
+
+def test_collisions_are_found_and_contacts_at_home_are_not() -> None:
+    touching = body_of(FOLD).collisions(np.array([[0.0], [1.4], [-1.4]]))
     assert touching == [(1, "world", "arm")]  # the axis turns it down
 
 
-def test_room_is_the_distance_beyond_the_one_to_keep(tmp_path: Path) -> None:
-    source = tmp_path / "near.xml"
-    source.write_text(
+def test_room_is_the_distance_beyond_the_one_to_keep() -> None:
+    body = body_of(
         """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
         <body pos="0 0 0.05"><joint axis="0 1 0" range="-2 2"/>
         <geom type="sphere" pos="0.5 0 0" size="0.02"/>
         <body pos="0.5 0 0.2"><joint type="slide" axis="0 0 1" range="-0.3 0.3"/>
         <geom type="sphere" size="0.03"/></body></body></worldbody></mujoco>"""
     )
-    body = Body.load(source)
     contacts = Contacts(body, 0.02, 0.05)
     # At home the ball is 0.03 above the floor, and keeps half of that.
     assert contacts.room(np.zeros(2)) == pytest.approx(0.015)
@@ -317,17 +328,18 @@ def test_room_is_the_distance_beyond_the_one_to_keep(tmp_path: Path) -> None:
     assert levers == pytest.approx([np.hypot(0.5, 0.5) + 0.03, 1.0], abs=0.02)
 
 
-def test_without_mujoco_one_sentence_says_what_to_install(arm: Body) -> None:
-    assert arm.source is not None
-    text = f"""
+def test_without_mujoco_one_sentence_says_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(ARM)
+    text = """
 import sys
 sys.modules["mujoco"] = None
 from dopt.errors import SpecificationError
 from dopt.robots import Body, RobotExplorer
 try:
-    Body.load({str(arm.source)!r})
+    Body.load(sys.argv[1])
 except SpecificationError as error:
     print(error)
 """
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", text, tmp_path / "arm.xml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout

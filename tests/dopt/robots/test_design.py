@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +16,7 @@ from dopt.robots.design import LEAST, Design, Problem, attainable, multisine
 from dopt.robots.limits import Limits
 from dopt.robots.parameters import relative_errors
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
-from tests.dopt.robots.test_body import arm, jaco, limits
+from tests.dopt.robots.test_body import FOLD, arm, body_of, jaco, limits, limits_of
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
 
@@ -88,8 +90,6 @@ def test_the_bound_of_viscous_friction_alone_is_full_speed(arm: Body, limits: Li
 
 
 def test_torque_limits_shorten_motions(arm: Body, limits: Limits) -> None:
-    import dataclasses
-
     weak = dataclasses.replace(limits, torque=limits.torque * np.array([0.03, 1.0, 1.0, 1.0]))
     problem = Problem(arm, weak, "mass", 6.0)
     family = Multisine(weak, 6.0)
@@ -111,16 +111,10 @@ class Dip(Family):
 
 
 def test_a_touch_between_the_rows_of_the_search_is_found_at_the_end(tmp_path: Path) -> None:
-    source = tmp_path / "fold.xml"
-    source.write_text(
-        """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
-        <body pos="0 0 0.5"><joint name="hinge" axis="0 1 0" range="-2 2"/>
-        <geom type="capsule" fromto="0 0 0 0.6 0 0" size="0.02"/></body></worldbody></mujoco>"""
+    body = body_of(FOLD)
+    limits = limits_of(
+        body, tmp_path, "joints: {hinge: {velocity: 2, acceleration: 9, torque: 40}}"
     )
-    given = "joints: {hinge: {velocity: 2, acceleration: 9, torque: 40}}"
-    (tmp_path / "limits.yaml").write_text(given)
-    body = Body.load(source)
-    limits = Limits.of(body, tmp_path / "limits.yaml")
     problem = Problem(body, limits, "mass", 3.0)
     one = problem.candidate(Dip(limits, 3.0), np.zeros(1))
     assert one.free
@@ -131,29 +125,14 @@ def test_a_touch_between_the_rows_of_the_search_is_found_at_the_end(tmp_path: Pa
     assert [each.free for each in design.candidates] == [not found for found in touched]
 
 
-def test_designs_are_the_same_for_a_seed_and_differ_between_seeds(
-    arm: Body, limits: Limits
-) -> None:
-    first, again, other = (
-        Design.of(Problem(arm, limits, "damping", 3.0), seed=seed, effort=30) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first.best.numbers, again.best.numbers)
-    assert first.best.score != other.best.score
-
-
 def test_expected_errors_are_reached_by_a_fit_to_simulated_torques() -> None:
     """Least squares on torques with the declared noise: errors as expected, over 200 draws."""
     body = jaco()
-    limits = Limits(
-        position=np.tile([-1.0, 1.0], (6, 1)),
-        velocity=np.full(6, 1.0),
-        acceleration=np.full(6, 5.0),
-        torque=np.full(6, 20.0),
-    )
+    sizes = (np.full(6, size) for size in (1.0, 5.0, 20.0))
+    limits = Limits(np.tile([-1.0, 1.0], (6, 1)), *sizes)
     problem = Problem(body, limits, "damping,frictionloss", 4.0, noise=1e-5, rate=100.0)
-    one = problem.candidate(
-        Ladder(limits, 4.0), np.random.default_rng(2).standard_normal(Ladder(limits, 4.0).size)
-    )
+    family = Ladder(limits, 4.0)
+    one = problem.candidate(family, np.random.default_rng(2).standard_normal(family.size))
     motion = one.motion(0.01)
     rows = problem.unknowns.weighted(motion, 100.0).reshape(-1, len(problem.unknowns))
     rng = np.random.default_rng(3)
@@ -168,14 +147,12 @@ def test_a_centre_on_the_axis_in_the_file_has_the_error_of_the_mass(tmp_path: Pa
 
     A robot whose centre is off by a tenth of its size has a tenth of the mass's error in it.
     """
-    (tmp_path / "wheel.xml").write_text(
+    body = body_of(
         """<mujoco><worldbody><body name="wheel"><joint name="axle" axis="0 1 0" range="-1 1"/>
         <inertial pos="0 0 0" mass="2" diaginertia="2e-4 2e-4 2e-4"/></body></worldbody></mujoco>"""
     )
-    body = Body.load(tmp_path / "wheel.xml")
     given = "joints: {axle: {velocity: 2, acceleration: 9, torque: 10}}"
-    (tmp_path / "limits.yaml").write_text(given)
-    limits = Limits.of(body, tmp_path / "limits.yaml")
+    limits = limits_of(body, tmp_path, given)
     problem = Problem(body, limits, "com_x,mass", 5.0, nuisance="", noise=0.001)
     family = Fourier(limits, 5.0, 5.0)
     motion = family.motion(np.random.default_rng(0).standard_normal(family.size), 0.01)
@@ -186,15 +163,21 @@ def test_a_centre_on_the_axis_in_the_file_has_the_error_of_the_mass(tmp_path: Pa
 
 def test_the_best_searched_family_has_the_whole_effort(arm: Body, limits: Limits) -> None:
     lines: list[str] = []
-    design = Design.of(Problem(arm, limits, "damping", 3.0), effort=120, progress=lines.append)
+    problem = Problem(arm, limits, "damping", 3.0)
+    first, again, other = (
+        Design.of(problem, seed=seed, effort=40, progress=progress)
+        for seed, progress in ((1, lines.append), (1, str), (2, str))
+    )
     searches = [line.split(" motions")[0] for line in lines if "motions" in line]
-    assert sorted(line.split(", ")[-1] for line in searches) == ["120", "30", "30", "30"]
-    assert searches[-1] == f"{design.best.name}, 120"
+    assert sorted(line.split(", ")[-1] for line in searches) == ["10", "10", "10", "40"]
+    assert searches[-1] == f"{first.best.name}, 40"
+    np.testing.assert_array_equal(first.best.numbers, again.best.numbers)
+    assert first.best.score != other.best.score
 
 
 @pytest.mark.parametrize("name", ["seconds", "noise", "rate"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_numbers_of_a_problem_are_positive(
+def test_numbers_of_problems_are_positive(
     arm: Body, limits: Limits, name: str, value: float
 ) -> None:
     with pytest.raises(SpecificationError, match=f"{name} of a design is .* but a number above 0"):
@@ -206,39 +189,32 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
 
     from dopt.robots.sysid import sequences
 
-    text = """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
+    (tmp_path / "two.xml").write_text(
+        """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
       <joint name="a" axis="0 1 0" damping="0.8"/>
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
       <body pos="0.3 0 0"><joint name="b" axis="0 1 0" damping="0.3"/>
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" contype="0" conaffinity="0"/>
       </body></body></worldbody></mujoco>"""
-    source = tmp_path / "two.xml"
-    source.write_text(text)
-    body = Body.load(source)
-    data = mujoco.MjData(body.model)
-    times = 0.002 * np.arange(700)
+    )
+    body = Body.load(tmp_path / "two.xml")
+    data, times = mujoco.MjData(body.model), 0.002 * np.arange(700)
     torques = np.stack([4.0 * np.sin(3.0 * times), 2.0 * np.sin(5.0 * times)], axis=1)
-    positions = []
-    for row in torques:
-        positions.append(data.qpos.copy())
+    q = np.zeros((700, 2))
+    for k, row in enumerate(torques):
+        q[k] = data.qpos
         data.qfrc_applied[:] = row
         mujoco.mj_step(body.model, data)
-    q = np.array(positions)
-    log = pd.DataFrame(
-        {"time": 5.0 + times, "q_a": q[:, 0], "q_b": q[:, 1]}
-        | {"tau_a": torques[:, 0], "tau_b": torques[:, 1]}
-    )
-    found = sequences(body, log)
-    parameters = sysid.ParameterDict()
+    columns = {"q_a": q[:, 0], "q_b": q[:, 1], "tau_a": torques[:, 0], "tau_b": torques[:, 1]}
+    log = pd.DataFrame({"time": 5.0 + times, **columns})
+    found, parameters = sequences(body, log), sysid.ParameterDict()
     for joint in body.joints:
 
-        def change(spec: object, one: object, joint: str = joint) -> None:
-            value = float(np.ravel(one.value)[0])  # type: ignore[attr-defined]  # of a library
-            spec.joint(joint).damping = [value, 0.0, 0.0]  # type: ignore[attr-defined]
+        def change(spec: Any, one: Any, joint: str = joint) -> None:
+            spec.joint(joint).damping = [float(np.ravel(one.value)[0]), 0.0, 0.0]
 
-        parameters.add(
-            sysid.Parameter(joint, nominal=0.5, min_value=0.01, max_value=5.0, modifier=change)
-        )
+        how = {"nominal": 0.5, "min_value": 0.01, "max_value": 5.0, "modifier": change}
+        parameters.add(sysid.Parameter(joint, **how))
     residual = sysid.build_residual_fn(models_sequences=[found])
     fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False)
     assert fitted["a"].value == pytest.approx(0.8, rel=0.02)

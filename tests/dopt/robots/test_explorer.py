@@ -1,7 +1,9 @@
 """Explorer of robots with a known body: limits, stops, payloads, and bad measurements."""
 
 import itertools
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,9 +14,11 @@ from dopt.robots.body import Body
 from dopt.robots.explorer import LOST, RobotExplorer
 from dopt.robots.friction import SPEEDS
 from dopt.robots.limits import Limits
-from dopt.robots.tracking import Guard, KnownBody
-from studies.robots.online import LOOK, explore, true_values
+from dopt.robots.tracking import Guard
+from studies.robots.online import LOOK, Trace, explore, true_values
 from studies.robots.simulated import SimulatedRobot, jaco
+
+Arm = Callable[[], tuple[Body, Limits]]
 
 ARM = """
 <mujoco>
@@ -57,6 +61,15 @@ def walled() -> tuple[Body, Limits]:
     return Body(mujoco.MjModel.from_xml_string(text)), small()[1]
 
 
+def pair(
+    seed: int, arm: Arm = small, payload: tuple[float, float] | None = None, **given: Any
+) -> tuple[SimulatedRobot, RobotExplorer]:
+    """Return a robot and its explorer."""
+    body, limits = arm()
+    robot = SimulatedRobot(body, limits, seed, payload=payload)
+    return robot, RobotExplorer(body, limits, seed=seed, **given)
+
+
 def positions_of(robot: SimulatedRobot, explorer: RobotExplorer, seconds: float) -> np.ndarray:
     """Return the true positions of a run, (T, n)."""
     found, q = [], robot.state()[0]
@@ -69,49 +82,45 @@ def positions_of(robot: SimulatedRobot, explorer: RobotExplorer, seconds: float)
     return np.array(found)
 
 
+def check_shares(trace: Trace, position: float = 1.0, velocity: float = 1.03) -> None:
+    """Check that positions, velocities and torques were within so large shares of their limits."""
+    assert trace.shares["position"] < position
+    assert trace.shares["velocity"] < velocity
+    assert trace.shares["torque"] <= 1.0
+
+
 @pytest.mark.parametrize("arm", [small, jaco])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_limits_are_kept_and_friction_is_learned(arm, seed: int) -> None:
-    body, limits = arm()
-    robot = SimulatedRobot(body, limits, seed)
-    explorer = RobotExplorer(body, limits, seed=seed)
+def test_limits_are_kept_and_friction_is_learned(arm: Arm, seed: int) -> None:
+    robot, explorer = pair(seed, arm)
     trace = explore(robot, explorer, 3.0)
-    assert trace.shares["position"] < 1.0
-    assert trace.shares["velocity"] < 1.03
-    assert trace.shares["torque"] <= 1.0
+    check_shares(trace)
     assert np.median(trace.errors[-1]) < 0.1
     assert explorer.counts["changed"] == 0
     assert explorer.counts["windows"] == explorer.steps // explorer.learner.window.size
 
 
 def test_references_keep_their_limits_exactly() -> None:
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 5)
-    explorer = RobotExplorer(body, limits, seed=5)
-    q = robot.state()[0]
+    robot, explorer = pair(5)
     for _ in range(1500):
-        torque = explorer.ask(q)
-        assert (np.abs(explorer._a) <= limits.acceleration).all()
-        assert (np.abs(explorer._v) <= limits.velocity).all()
-        robot.step(torque)
-        q = robot.state()[0]
-        explorer.tell(q, torque)
+        positions_of(robot, explorer, explorer.dt)
+        assert (np.abs(explorer._a) <= robot.limits.acceleration).all()
+        assert (np.abs(explorer._v) <= robot.limits.velocity).all()
 
 
-@pytest.mark.parametrize(("inputs", "seeds"), [("references", 20), ("torques", 4)])
+@pytest.mark.parametrize(("inputs", "seeds"), [("references", 4), ("torques", 1)])
 def test_bodies_do_not_touch_what_they_do_not_touch_at_home(inputs: str, seeds: int) -> None:
-    body, limits = walled()
     near = 0
     for seed in range(seeds):
-        explorer = RobotExplorer(body, limits, inputs=inputs, seed=seed)
-        went = positions_of(SimulatedRobot(body, limits, seed), explorer, 2.0)
-        assert not body.collisions(went)
+        robot, explorer = pair(seed, walled, inputs=inputs)
+        went = positions_of(robot, explorer, 2.0)
+        assert not robot.body.collisions(went)
         assert np.ptp(went[-500:], axis=0).max() > 0.1  # it does not stay before the wall
         near += explorer.counts["near"]
     assert near >= seeds / 2
-    blind = RobotExplorer(small()[0], limits, inputs=inputs, seed=0)
-    assert blind.counts["near"] == 0
-    assert body.collisions(positions_of(SimulatedRobot(body, limits, 0), blind, 4.0))
+    blind = pair(0, inputs=inputs)
+    assert robot.body.collisions(positions_of(*blind, 4.0))
+    assert blind[1].counts["near"] == 0
 
 
 def test_geoms_that_cannot_collide_are_not_looked_at() -> None:
@@ -124,30 +133,25 @@ def test_geoms_that_cannot_collide_are_not_looked_at() -> None:
 
 
 def test_friction_is_learned_beside_a_wall() -> None:
-    body, limits = walled()
-    robot = SimulatedRobot(body, limits, 2)
-    explorer = RobotExplorer(body, limits, seed=2)
+    robot, explorer = pair(2, walled)
     trace = explore(robot, explorer, 5.0)
     assert explorer.counts["near"] > 0
     assert trace.errors[-1].max() < 0.1
-    assert trace.shares["position"] < 1.0
-    assert trace.shares["velocity"] < 1.03
+    check_shares(trace)
 
 
 def test_a_robot_that_begins_too_near_a_wall_leaves_it() -> None:
-    body, limits = walled()
-    robot = SimulatedRobot(body, limits, 0)
+    robot, explorer = pair(0, walled)
     turned = np.array([np.arcsin((0.25 - 0.034) / 0.55), 0.0, 0.0])  # 4 mm from the wall
     robot.place(turned)
-    went = positions_of(robot, RobotExplorer(body, limits), 2.0)
-    assert not body.collisions(went)
+    went = positions_of(robot, explorer, 2.0)
+    assert not robot.body.collisions(went)
     assert went[:, 0].min() < turned[0] - 0.1
 
 
 def test_it_stops_when_every_interval_is_as_narrow_as_asked_for() -> None:
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 2)
-    explorer = RobotExplorer(body, limits, stop={"curve": 0.15, "viscous": 0.3}, seed=2)
+    robot, explorer = pair(2, stop={"curve": 0.15, "viscous": 0.3})
+    limits = robot.limits
     explore(robot, explorer, 12.0, until_done=True)
     assert explorer.done
     values, half = explorer.learner.intervals()
@@ -165,9 +169,8 @@ def test_it_stops_when_every_interval_is_as_narrow_as_asked_for() -> None:
 
 
 def test_a_payload_is_noticed_said_once_and_weighed() -> None:
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 1, payload=(4.0, 0.8))
-    explorer = RobotExplorer(body, limits, seed=1)
+    robot, explorer = pair(1, payload=(4.0, 0.8))
+    body = robot.body
     own = explorer.known.model.body_mass[body.moved[-1]]
     explore(robot, explorer, 3.9)
     assert explorer.counts["changed"] == 0
@@ -178,31 +181,10 @@ def test_a_payload_is_noticed_said_once_and_weighed() -> None:
     assert body.model.body_mass[body.moved[-1]] == own
 
 
-def test_a_hung_point_mass_adds_its_gravity_and_inertia() -> None:
-    body = small()[0]
-    known, last = KnownBody(body), body.moved[-1]
-    place, mass = np.array([0.3, 0.05, -0.1]), 0.7
-    known.hang(mass, mass * place)
-    spec = mujoco.MjSpec.from_string(ARM)
-    held = spec.bodies[last].add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-4, 0, 0])
-    held.pos, held.mass = place, mass
-    expected = KnownBody(Body(spec.compile()))
-    q, v, a = np.array([0.3, -0.6, 0.9]), np.array([1.0, -0.5, 2.0]), np.array([3.0, 2.0, -1.0])
-    zero = np.zeros(3)
-    np.testing.assert_allclose(known.inverse(q, zero, zero), expected.inverse(q, zero, zero))
-    # The inertia of the estimate is about any axis: it is the larger one.
-    np.testing.assert_allclose(known.inverse(q, v, a), expected.inverse(q, v, a), rtol=0.35)
-
-
 @pytest.mark.parametrize("friction", ["coulomb_viscous", "network"])
 def test_torques_stay_on_the_ball_or_brake(friction: str) -> None:
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 3)
-    explorer = RobotExplorer(body, limits, inputs="torques", friction=friction, gamma=0.2, seed=3)
-    trace = explore(robot, explorer, 1.5)
-    assert trace.shares["torque"] <= 1.0
-    assert trace.shares["position"] < 1.02
-    assert trace.shares["velocity"] < 1.1
+    robot, explorer = pair(3, inputs="torques", friction=friction, gamma=0.2)
+    check_shares(explore(robot, explorer, 1.5), 1.02, 1.1)
     assert explorer.counts["plans"] == 0
 
 
@@ -210,14 +192,14 @@ def test_the_step_of_torques_is_the_best_on_the_ball() -> None:
     body, limits = small()
     explorer = RobotExplorer(body, limits, inputs="torques", friction="network", gamma=0.3)
     explorer.ask(np.zeros(3))
-    learner, tracker = explorer.learner, explorer._tracker
+    learner, tracker, p = explorer.learner, explorer._tracker, explorer.learner.p
     tracker.v[:] = [0.2, -0.1, 0.3]
     explorer._torques()
-    p = learner.p
+    bias = explorer.known.inverse(tracker.q, tracker.v, np.zeros(3))
+    mass = explorer.known.mass_matrix()
+    inverse = np.linalg.inv(mass)
 
     def gain(u: np.ndarray) -> float:
-        bias = explorer.known.inverse(tracker.q, tracker.v, np.zeros(3))
-        inverse = np.linalg.inv(explorer.known.mass_matrix())
         idle = inverse @ (-bias - learner.torques(tracker.v))
         x = (tracker.v + explorer.dt * idle) / limits.velocity
         J = learner.model.jacobian(learner.mean[:, :p], x[:, None])[:, 0]
@@ -226,8 +208,6 @@ def test_the_step_of_torques_is_the_best_on_the_ball() -> None:
         rows = J + bent * moved[:, None]
         return float(np.einsum("np,npq,nq->", rows, learner.covariance[:, :p, :p], rows))
 
-    bias = explorer.known.inverse(tracker.q, tracker.v, np.zeros(3))
-    mass = explorer.known.mass_matrix()
     chosen = mass @ explorer._a + bias + learner.torques(tracker.v)
     assert np.linalg.norm(chosen / limits.torque) == pytest.approx(0.3)
     random = np.random.default_rng(0).standard_normal((3, 500))
@@ -237,32 +217,18 @@ def test_the_step_of_torques_is_the_best_on_the_ball() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, 1.0])
 def test_bad_measurements_are_counted_and_the_robot_brakes(bad: float) -> None:
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 4)
-    explorer = RobotExplorer(body, limits, seed=4)
+    robot, explorer = pair(4)
     explore(robot, explorer, 1.0)
     speed = np.abs(explorer._v).sum()
     for _ in range(40):
-        wrong = robot.state()[0] + [0.0, bad, 0.0]
-        torque = explorer.ask(wrong)
+        torque = explorer.ask(robot.state()[0] + [0.0, bad, 0.0])
         assert np.isfinite(torque).all()
         robot.step(torque)
         explorer.tell(robot.state()[0] + [0.0, bad, 0.0], torque)
     assert explorer.counts["bad"] == 40
     assert np.abs(explorer._v).sum() < speed
-    trace = explore(robot, explorer, 1.0)
+    check_shares(explore(robot, explorer, 1.0))
     assert explorer.counts["bad"] == 40
-    assert trace.shares["velocity"] < 1.03
-
-
-def test_a_plan_that_is_late_leaves_the_joint_braking() -> None:
-    body, limits = small()
-    explorer = RobotExplorer(body, limits, deadline=1e-9)
-    torque = explorer.ask(np.zeros(3))
-    assert np.isfinite(torque).all()
-    assert explorer.counts["late"] == 3
-    assert explorer.counts["plans"] == 0
-    np.testing.assert_array_equal(explorer._v, 0.0)
 
 
 def test_a_clock_that_is_slow_leaves_joints_braking_within_their_limits(
@@ -271,9 +237,7 @@ def test_a_clock_that_is_slow_leaves_joints_braking_within_their_limits(
     ticks, slow = itertools.count(), 0.0
     now = SimpleNamespace(perf_counter=lambda: slow * next(ticks))
     monkeypatch.setattr("dopt.robots.explorer.clock", now)
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 6)
-    explorer = RobotExplorer(body, limits, deadline=5e-4, seed=6)
+    robot, explorer = pair(6, deadline=5e-4)
     explore(robot, explorer, 1.0)
     assert explorer.counts["late"] == 0
     plans, slow = explorer.counts["plans"], 1e-3  # of a second, a call
@@ -281,20 +245,15 @@ def test_a_clock_that_is_slow_leaves_joints_braking_within_their_limits(
     assert explorer.counts["plans"] == plans
     assert explorer.counts["late"] > 100
     np.testing.assert_array_equal(explorer._v, 0.0)
-    assert np.abs(robot.v / limits.velocity).max() < 0.02
+    assert np.abs(robot.v / robot.limits.velocity).max() < 0.02
+    check_shares(trace)
     slow = 0.0
-    again = explore(robot, explorer, 1.0)
+    check_shares(explore(robot, explorer, 1.0))
     assert explorer.counts["plans"] > plans
-    for shares in (trace.shares, again.shares):
-        assert shares["position"] < 1.0
-        assert shares["velocity"] < 1.03
-        assert shares["torque"] <= 1.0
 
 
 def test_an_encoder_that_stays_displaced_is_believed_after_a_while() -> None:
-    body, limits = small()
-    robot = SimulatedRobot(body, limits, 7)
-    explorer = RobotExplorer(body, limits, seed=7)
+    robot, explorer = pair(7)
     explore(robot, explorer, 1.0)
     bad, windows, moved = [], explorer.counts["windows"], np.array([0.0, 0.3, 0.0])
     for _ in range(500):
@@ -308,8 +267,7 @@ def test_an_encoder_that_stays_displaced_is_believed_after_a_while() -> None:
 
 
 def test_a_gap_in_time_ends_the_window() -> None:
-    body, limits = small()
-    explorer = RobotExplorer(body, limits)
+    explorer = RobotExplorer(*small())
     for k in range(10):
         torque = explorer.ask(np.zeros(3), 0.002 * k)
         explorer.tell(np.zeros(3), torque)
@@ -319,18 +277,18 @@ def test_a_gap_in_time_ends_the_window() -> None:
 
 
 def test_bad_arguments_are_refused_with_a_remedy() -> None:
-    body, limits = small()
-    with pytest.raises(SpecificationError, match="did you mean 'references'"):
-        RobotExplorer(body, limits, inputs="reference")
-    with pytest.raises(SpecificationError, match="coulomb_viscous, network"):
-        RobotExplorer(body, limits, friction="dry")
-    with pytest.raises(SpecificationError, match="curve, viscous"):
-        RobotExplorer(body, limits, stop={"stribeck": 0.1})
-    with pytest.raises(SpecificationError, match="below 1"):
-        RobotExplorer(body, limits, stop={"curve": 5.0})
+    given: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"inputs": "reference"}, "did you mean 'references'"),
+        ({"friction": "dry"}, "coulomb_viscous, network"),
+        ({"stop": {"stribeck": 0.1}}, "curve, viscous"),
+        ({"stop": {"curve": 5.0}}, "below 1"),
+    )
+    for more, said in given:
+        with pytest.raises(SpecificationError, match=said):
+            pair(0, **more)
     with pytest.raises(SpecificationError, match="drives 6"):
-        RobotExplorer(jaco()[0], limits)
-    explorer = RobotExplorer(body, limits)
+        RobotExplorer(jaco()[0], small()[1])
+    explorer = RobotExplorer(*small())
     with pytest.raises(ExplorationError, match="ask first"):
         explorer.tell(np.zeros(3))
     with pytest.raises(ExplorationError, match="encoders"):

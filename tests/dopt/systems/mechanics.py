@@ -9,23 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp
 
-from dopt.systems import (
-    Arm,
-    Car,
-    Cartpole,
-    CartpoleUnknownGain,
-    Chain,
-    CoupledPendulums,
-    DriftingPendulum,
-    Drone,
-    MassSpring,
-    Pendulum,
-    PendulumUnknownGain,
-    Quadrotor,
-    System,
-    UnbalancedDisk,
-    VanDerPol,
-)
+from dopt.systems import System
 
 
 def tensor_of(values: list[float]) -> Tensor:
@@ -36,10 +20,12 @@ def tensor_of(values: list[float]) -> Tensor:
 class Mechanics(ABC):
     """Masses and forces of one system, over generalised coordinates q and their rates."""
 
-    coordinates: tuple[int, ...]  # indices of q in the state; the rates follow each by one
+    coordinates: tuple[int, ...] = ()
+    """Indices of q in the state, the angles where none are named; the rates follow each by one."""
 
     def __init__(self, system: System) -> None:
         self.system = system
+        self.coordinates = self.coordinates or system.angle_indices
 
     @abstractmethod
     def masses(self) -> list[float]:
@@ -49,13 +35,13 @@ class Mechanics(ABC):
     def positions(self, q: Tensor) -> Tensor:
         """Return their positions (horizontal, upward) [m], (number of masses, 2)."""
 
-    @abstractmethod
-    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
-        """Return the generalised forces of the input."""
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        """Return the generalised forces of the input: one on each coordinate."""
+        return u
 
-    @abstractmethod
     def friction(self, rates: Tensor) -> Tensor:
-        """Return the generalised forces of friction."""
+        """Return the generalised forces of friction: the same on each rate."""
+        return -getattr(self.system, "friction", 0.0) * rates
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return q and its rates."""
@@ -73,11 +59,6 @@ class Mechanics(ABC):
     def energy(self, state: Tensor) -> Tensor:
         q, rates = self.split(state)
         return self.kinetic(q, rates) + self.potential(q)
-
-    def power(self, state: Tensor, u: Tensor) -> Tensor:
-        """Return the power of the input less the power of friction [W]."""
-        q, rates = self.split(state)
-        return (self.driving(q, rates, u) + self.friction(rates)) @ rates
 
     def accelerations(self, state: Tensor, u: Tensor) -> Tensor:
         """Return d²q/dt² by d/dt ∂L/∂q̇ - ∂L/∂q = forces."""
@@ -115,10 +96,6 @@ class CarMechanics(Mechanics):
         world = [ahead * cosine - left * sine, ahead * sine + left * cosine, state[5]]
         return state[:3], torch.stack(world)
 
-    def power(self, state: Tensor, u: Tensor) -> Tensor:
-        self.angle = state[6]
-        return super().power(state, u)
-
     def accelerations(self, state: Tensor, u: Tensor) -> Tensor:
         self.angle = state[6]
         return super().accelerations(state, u)
@@ -138,9 +115,6 @@ class CarMechanics(Mechanics):
         held = -grips * (velocity * across).sum(-1) / speeds
         forces = held.unsqueeze(-1) * across + tensor_of([0.0, 0.0, 1.0])[:, None] * push * rolling
         return torch.einsum("iaq,ia->q", moved, forces)
-
-    def friction(self, rates: Tensor) -> Tensor:
-        return torch.zeros_like(rates)
 
 
 class DroneMechanics(Mechanics):
@@ -198,9 +172,6 @@ class DroneMechanics(Mechanics):
         slowed = -system.drag * (v.square().sum() + system.slow_speed**2).sqrt() * v
         return lifted + turned + torch.cat([slowed, torch.zeros_like(q[3:])])
 
-    def friction(self, rates: Tensor) -> Tensor:
-        return torch.zeros_like(rates)
-
 
 def _quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     real = a[0] * b[0] - a[1:] @ b[1:]
@@ -216,8 +187,6 @@ def _turned(e: Tensor, vector: Tensor) -> Tensor:
 
 
 class PendulumMechanics(Mechanics):
-    coordinates = (0,)
-
     def masses(self) -> list[float]:
         return [self.system.mass / 2, self.system.mass / 2]
 
@@ -226,17 +195,9 @@ class PendulumMechanics(Mechanics):
         radius = self.system.length * gauss
         return torch.stack([radius * q[0].sin(), -radius * q[0].cos()], dim=-1)
 
-    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
-        return u
-
-    def friction(self, rates: Tensor) -> Tensor:
-        return -self.system.friction * rates
-
 
 class UnbalancedDiskMechanics(Mechanics):
     """Unit inertia: a unit mass at the end of a rod of 1 m."""
-
-    coordinates = (0,)
 
     def masses(self) -> list[float]:
         return [1.0]
@@ -273,8 +234,6 @@ class CartpoleMechanics(Mechanics):
 
 
 class ArmMechanics(Mechanics):
-    coordinates = (0, 2)
-
     def masses(self) -> list[float]:
         return [self.system.mass_1, self.system.mass_2]
 
@@ -283,18 +242,8 @@ class ArmMechanics(Mechanics):
         links = torch.stack([lengths * q.sin(), -lengths * q.cos()], dim=-1)
         return links.cumsum(0)
 
-    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
-        return u
-
-    def friction(self, rates: Tensor) -> Tensor:
-        return -self.system.friction * rates
-
 
 class ChainMechanics(Mechanics):
-    def __init__(self, system: System) -> None:
-        super().__init__(system)
-        self.coordinates = system.angle_indices
-
     def masses(self) -> list[float]:
         return [self.system.mass] * self.system.n_links
 
@@ -310,16 +259,9 @@ class ChainMechanics(Mechanics):
 
         return jacrev(joints)(q).mT @ u + 0.0 * rates
 
-    def friction(self, rates: Tensor) -> Tensor:
-        return -self.system.friction * rates
-
 
 class CoupledPendulumsMechanics(Mechanics):
     """Unit masses at the ends of rods of 1 m, with torsion springs between neighbours."""
-
-    def __init__(self, system: System) -> None:
-        super().__init__(system)
-        self.coordinates = system.angle_indices
 
     def masses(self) -> list[float]:
         return [1.0] * self.system.n_pendulums
@@ -333,9 +275,6 @@ class CoupledPendulumsMechanics(Mechanics):
 
     def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
         return torch.cat([u, torch.zeros_like(q[1:])])
-
-    def friction(self, rates: Tensor) -> Tensor:
-        return -self.system.friction * rates
 
 
 class QuadrotorMechanics(Mechanics):
@@ -383,9 +322,6 @@ class MassSpringMechanics(Mechanics):
     def potential(self, q: Tensor) -> Tensor:
         return 0.5 * self.system.stiffness * self.extensions(q).square().sum()
 
-    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
-        return u
-
     def friction(self, rates: Tensor) -> Tensor:
         """Return the slope of Rayleigh's dissipation, half of each damper's power."""
 
@@ -414,9 +350,6 @@ class VanDerPolMechanics(Mechanics):
         inside = 1.0 - (q / self.system.amplitude).square()
         return u + self.system.damping * inside * rates
 
-    def friction(self, rates: Tensor) -> Tensor:
-        return torch.zeros_like(rates)
-
 
 class PendulumUnknownGainMechanics(PendulumMechanics):
     def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
@@ -428,45 +361,22 @@ class CartpoleUnknownGainMechanics(CartpoleMechanics):
         return super().driving(q, rates, self.system.gain * u)
 
 
-MECHANICS: dict[type[System], type[Mechanics]] = {
-    Pendulum: PendulumMechanics,
-    Cartpole: CartpoleMechanics,
-    Arm: ArmMechanics,
-    Quadrotor: QuadrotorMechanics,
-    MassSpring: MassSpringMechanics,
-    DriftingPendulum: PendulumMechanics,
-    Chain: ChainMechanics,
-    PendulumUnknownGain: PendulumUnknownGainMechanics,
-    CartpoleUnknownGain: CartpoleUnknownGainMechanics,
-    UnbalancedDisk: UnbalancedDiskMechanics,
-    CoupledPendulums: CoupledPendulumsMechanics,
-    VanDerPol: VanDerPolMechanics,
-    Car: CarMechanics,
-    Drone: DroneMechanics,
+MECHANICS: dict[str, type[Mechanics]] = {
+    "pendulum": PendulumMechanics,
+    "cartpole": CartpoleMechanics,
+    "arm": ArmMechanics,
+    "quadrotor": QuadrotorMechanics,
+    "mass_spring": MassSpringMechanics,
+    "drifting_pendulum": PendulumMechanics,
+    "chain": ChainMechanics,
+    "pendulum_unknown_gain": PendulumUnknownGainMechanics,
+    "cartpole_unknown_gain": CartpoleUnknownGainMechanics,
+    "unbalanced_disk": UnbalancedDiskMechanics,
+    "coupled_pendulums": CoupledPendulumsMechanics,
+    "van_der_pol": VanDerPolMechanics,
+    "car": CarMechanics,
+    "drone": DroneMechanics,
 }
 
 WITHOUT_INERTIA = ("moving_star",)
 """Systems of first order, which have no kinetic energy: each has tests of its own."""
-
-FRICTION = {
-    "pendulum": ("friction",),
-    "cartpole": ("pivot_friction", "cart_friction"),
-    "arm": ("friction",),
-    "quadrotor": ("drag",),
-    "mass_spring": ("damping",),
-    "drifting_pendulum": ("friction", "final_friction"),
-    "chain": ("friction",),
-    "pendulum_unknown_gain": ("friction",),
-    "cartpole_unknown_gain": ("pivot_friction", "cart_friction"),
-    "unbalanced_disk": ("friction", "dry_friction"),
-    "coupled_pendulums": ("friction",),
-    "van_der_pol": ("damping",),
-    "car": ("front_grip", "rear_grip", "drag"),
-    "drone": ("drag", "turn_drag"),
-}
-
-HOVERING = ("drone",)
-"""Systems that thrust carries without an input, which may feed them energy."""
-
-SELF_EXCITED = ("van_der_pol",)
-"""Systems whose friction feeds energy at some states."""

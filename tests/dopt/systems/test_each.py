@@ -35,7 +35,7 @@ from dopt.systems import (
 from dopt.systems.elementary import cos, magnitude, sign, sin, tanh, where
 from dopt.systems.pendulum import LARGEST_ROW
 from dopt.systems.properties import jacobians
-from tests.dopt.systems.mechanics import ChainMechanics, CoupledPendulumsMechanics
+from tests.dopt.systems.mechanics import MECHANICS
 from tests.dopt.systems.strategies import assert_compiled_equations_agree
 from tests.dopt.test_checks import broken_system
 
@@ -69,30 +69,9 @@ def test_a_tyre_never_pulls_harder_than_its_grip() -> None:
 CONSTANTS = {"mass": 0.7, "length": 0.6, "friction": 0.3}
 
 
-def point(system: Chain, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def point(system: System, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return rng.normal(size=system.n_states), rng.normal(size=system.n_inputs)
-
-
-@pytest.mark.parametrize("n_links", [1, 2, 3, 7])
-def test_a_chain_of_any_length_obeys_euler_and_lagrange(n_links: int) -> None:
-    chain = Chain(n_links=n_links, **CONSTANTS)
-    for seed in range(5):
-        x, u = point(chain, seed)
-        expected = ChainMechanics(chain).accelerations(torch.tensor(x), torch.tensor(u)).numpy()
-        flow = chain.derivative(x, u)
-        assert flow[1::2] == pytest.approx(expected, rel=1e-9, abs=1e-9)
-        assert np.array_equal(flow[::2], x[1::2])
-
-
-def test_a_chain_of_two_links_is_an_arm() -> None:
-    """The arm's torques turn its links against the ground, the chain's against each other."""
-    chain = Chain(n_links=2, **CONSTANTS)
-    arm = Arm(mass_1=0.7, mass_2=0.7, length_1=0.6, length_2=0.6, friction=0.3)
-    for seed in range(5):
-        x, u = point(chain, seed)
-        on_links = np.array([u[0] - u[1], u[1]])
-        assert chain.derivative(x, u) == pytest.approx(arm.derivative(x, on_links), rel=1e-11)
 
 
 @pytest.mark.parametrize("n_links", [1, 2, 5])
@@ -105,37 +84,37 @@ def test_a_hanging_chain_swings_at_the_zeros_of_a_laguerre_polynomial(n_links: i
     assert squares == pytest.approx(zeros * 10.0 / 0.6, rel=1e-6)
 
 
-@pytest.mark.parametrize("n_links", [1, 3, 5])
-def test_compiled_equations_are_those_of_a_chain_of_that_length(n_links: int) -> None:
-    chain = Chain(n_links=n_links, **CONSTANTS)
-    assert_compiled_equations_agree(chain, *point(chain, 1))
-
-
 def test_what_depends_on_the_number_of_links_follows_it() -> None:
+    """Also what is compiled."""
     chain = Chain(n_links=3, initial_state=(0.1, 0.2), grid_half_widths=(1, 2, 3, 4, 5, 6))
+    assert_compiled_equations_agree(chain, *point(chain, 1))
     assert (chain.n_states, chain.n_inputs, chain.n_learned) == (6, 3, 3)
     assert chain.initial_state == (0.1, 0.2) * 3
     assert chain.features[-1] == Feature("identity", 5)
     assert chain.feature_scales == (1, 1, 2, 1, 1, 4, 1, 1, 6)
     assert dataclasses.replace(chain) == chain
     assert Chain.learned_rows == Chain().learned_rows == (1, 3, 5, 7, 9)
-
-
-def test_links_without_number_are_refused() -> None:
     with pytest.raises(SpecificationError, match=r"n_links is 101, .* at most 100"):
         Chain(n_links=101)
     with pytest.raises(SpecificationError, match=r"initial_state has 3 entries, but chain needs 4"):
         Chain(n_links=2, initial_state=(0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_a_row_of_any_length_obeys_euler_and_lagrange(n: int) -> None:
-    row, rng = CoupledPendulums(n_pendulums=n, gravity=2.0, coupling=3.0), np.random.default_rng(n)
-    for _ in range(5):
-        x, u = rng.normal(size=2 * n), rng.normal(size=1)
-        mechanics = CoupledPendulumsMechanics(row)
+@pytest.mark.parametrize(
+    "system",
+    [
+        *(Chain(n_links=n, **CONSTANTS) for n in (1, 2, 3, 7)),
+        *(CoupledPendulums(n_pendulums=n, gravity=2.0, coupling=3.0) for n in (1, 2, 5)),
+    ],
+)
+def test_chains_and_rows_of_any_length_obey_euler_and_lagrange(system: System) -> None:
+    mechanics = MECHANICS[system.name](system)
+    for seed in range(5):
+        x, u = point(system, seed)
         expected = mechanics.accelerations(torch.tensor(x), torch.tensor(u)).numpy()
-        assert row.derivative(x, u)[1::2] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        flow = system.derivative(x, u)
+        assert flow[1::2] == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert np.array_equal(flow[::2], x[1::2])
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
@@ -154,13 +133,6 @@ def test_the_longest_row_loses_energy_in_every_mode_under_the_euler_map() -> Non
     assert np.abs(np.linalg.eigvals(np.eye(row.n_states) + row.dt * A)).max() < 1.0
 
 
-def test_the_input_turns_the_first_pendulum_alone() -> None:
-    row = CoupledPendulums(n_pendulums=4)
-    x = np.random.default_rng(0).normal(size=8)
-    change = row.derivative(x, [2.0]) - row.derivative(x, [0.0])
-    assert change == pytest.approx([0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
 def test_an_upright_drone_hovers_and_one_upside_down_falls() -> None:
     drone = Drone()
     assert drone.derivative(drone.initial_state, np.zeros(4)) == pytest.approx(0.0, abs=1e-14)
@@ -169,6 +141,10 @@ def test_an_upright_drone_hovers_and_one_upside_down_falls() -> None:
     fall = drone.derivative(over, np.zeros(4))
     assert fall[5] == pytest.approx(-2.0 * drone.gravity)
     assert np.delete(fall, 5) == pytest.approx(0.0, abs=1e-14)
+    # Drag balances the fall at the terminal speed, ρ √(v² + v₀²) v = 2 m g.
+    square, weight = drone.slow_speed**2, 2.0 * drone.mass * drone.gravity / drone.drag
+    over[5] = -np.sqrt((np.sqrt(square**2 + 4.0 * weight**2) - square) / 2.0)
+    assert drone.derivative(over, np.zeros(4))[5] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_euler_steps_keep_the_norm_of_the_quaternion() -> None:
@@ -178,17 +154,6 @@ def test_euler_steps_keep_the_norm_of_the_quaternion() -> None:
     path = simulate(drone, drone.gamma * inputs)
     assert np.abs(path[..., 10:]).max() > 2.0, "it turns"
     assert np.linalg.norm(path[..., 6:10], axis=-1) == pytest.approx(1.0, abs=0.01)
-
-
-def test_drag_balances_a_fall_at_the_terminal_speed() -> None:
-    """ρ √(v² + v₀²) v = 2 m g for a drone that falls upside down."""
-    drone = Drone()
-    square = drone.slow_speed**2
-    weight = 2.0 * drone.mass * drone.gravity / drone.drag
-    speed = np.sqrt((np.sqrt(square**2 + 4.0 * weight**2) - square) / 2.0)
-    state = np.zeros(13)
-    state[5], state[7] = -speed, 1.0
-    assert drone.derivative(state, np.zeros(4))[5] == pytest.approx(0.0, abs=1e-12)
 
 
 Function = Callable[[Any], Any]
@@ -227,11 +192,7 @@ def test_a_complex_step_takes_the_derivative(name: str) -> None:
         for value in (np.complex128(x + 1j * step), np.array([x + 1j * step])):
             found = np.asarray(function(value)).imag / step
             assert float(np.ravel(found)[0]) == pytest.approx(slope(function, x), abs=1e-8)
-
-
-def test_the_sign_of_zero_is_zero_and_of_nan_is_nan() -> None:
-    assert sign(0.0) == 0.0
-    assert sign(np.complex128(0.0 + 1e-30j)) == 0.0
+    assert sign(0.0) == sign(np.complex128(0.0 + 1e-30j)) == 0.0
     assert math.isnan(sign(math.nan))
 
 
@@ -359,41 +320,25 @@ def test_every_shipped_system_has_a_rigid_body(name: str) -> None:
         np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape))
 
 
-def test_a_pendulum_hangs_at_rest_and_swings_to_the_right() -> None:
-    tips = body_of(Pendulum(length=2.0), np.array([[0.0, 0.0], [np.pi / 2, 0.0]])).masses[:, 0]
-    np.testing.assert_allclose(tips, [[0, -2], [2, 0]], atol=1e-12)
-
-
-def test_the_height_of_a_mass_is_its_potential_energy() -> None:
-    """The weight times the height is the energy whose slope the equations feel."""
-    system, eps = Pendulum(friction=0.0), 1e-6
-    angles = np.linspace(-3, 3, 20)
-    up, down = (
-        body_of(system, np.stack([angles + sign * eps, 0 * angles], axis=1)).masses[:, 0, 1]
-        for sign in (1, -1)
-    )
-    slope = system.mass * system.gravity * (up - down) / (2 * eps) / 2  # the rod's middle
-    inertia = system.mass * system.length**2 / 3
-    accelerations = system.learned(np.stack([angles, 0 * angles], axis=1))[:, 0]
-    np.testing.assert_allclose(-slope / inertia, accelerations, rtol=1e-6)
-
-
-def test_a_pole_stands_upright_at_zero_and_leans_to_the_right() -> None:
-    at = np.array([[1.0, 0, 0, 0], [1.0, 0, np.pi / 2, 0]])
-    np.testing.assert_allclose(body_of(Cartpole(), at).masses[:, 0], [[1, 1], [2, 0]], atol=1e-12)
-
-
-def test_an_arm_has_absolute_angles() -> None:
-    hand = body_of(Arm(), np.array([[np.pi / 2, 0, 0.0, 0]])).masses[0, 1]
-    np.testing.assert_allclose(hand, [1, -1], atol=1e-12)
+@pytest.mark.parametrize(
+    ("system", "at", "masses"),
+    [
+        (Pendulum(length=2.0), [[0.0, 0], [np.pi / 2, 0]], [[[0, -2]], [[2, 0]]]),
+        (Cartpole(), [[1.0, 0, 0, 0], [1.0, 0, np.pi / 2, 0]], [[[1, 1]], [[2, 0]]]),
+        (Arm(), [[np.pi / 2, 0, 0.0, 0]], [[[1, 0], [1, -1]]]),
+        (
+            MassSpring(),
+            [[0.0, 1, 0, 2], [0.5, 0, -0.5, 0]],
+            [[[-1, 0], [1, 0]], [[-0.5, 0], [0.5, 0]]],
+        ),
+    ],
+)
+def test_masses_are_drawn_where_they_are(system: System, at: Any, masses: Any) -> None:
+    """A pendulum hangs at rest, a pole stands, and the links of an arm have absolute angles."""
+    np.testing.assert_allclose(body_of(system, np.array(at)).masses, masses, atol=1e-12)
 
 
 def test_a_quadrotor_tilts_its_right_side_up() -> None:
     (bar,) = body_of(Quadrotor(), np.array([[3.0, 0, 4.0, 0, 0.1, 0]])).lines
     assert bar[0, 1, 1] > 4.0 > bar[0, 0, 1]
     np.testing.assert_allclose(bar[0].mean(axis=0), [3, 4])
-
-
-def test_masses_between_springs_move_along_a_level_line() -> None:
-    found = body_of(MassSpring(), np.array([[0.0, 1.0, 0.0, 2.0], [0.5, 0.0, -0.5, 0.0]])).masses
-    np.testing.assert_allclose(found, [[[-1, 0], [1, 0]], [[-0.5, 0], [0.5, 0]]])

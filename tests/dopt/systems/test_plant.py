@@ -53,6 +53,9 @@ def test_a_declaration_is_a_system() -> None:
     ]
     assert system.feature_scales == (2.0, 1.0, 1.0, 4.0)
     assert system.grid_box() == {1: (-2.0, 2.0), 2: (-np.pi, np.pi), 3: (-4.0, 4.0)}
+    assert np.isnan(system.learned(np.zeros((4, 4)))).all(), "what is learned is unknown"
+    with pytest.raises(SpecificationError, match="not affine"):
+        dataclasses.replace(CRANE, known={"speed": "left + right + 0.1 * left * right"})
 
 
 def test_the_known_part_is_that_of_the_expressions_in_python_and_compiled() -> None:
@@ -66,11 +69,6 @@ def test_the_known_part_is_that_of_the_expressions_in_python_and_compiled() -> N
     states = np.array([x, x])
     flow = system.known(tuple(states.T), u, system.parameters)
     assert np.allclose(np.broadcast_arrays(*flow)[3], expected[3])
-
-
-def test_the_accelerations_are_unknown() -> None:
-    system = MOTOR.system(3)
-    assert np.isnan(system.learned(np.zeros((4, 2)))).all()
 
 
 @pytest.mark.parametrize("plant", [MOTOR, CRANE])
@@ -179,11 +177,6 @@ def test_effects_poles_and_domains_of_states_are_left_to_the_user(rate: str) -> 
     dataclasses.replace(MOTOR, known={"angle": "rate", "rate": rate}, constants=constants)
 
 
-def test_a_product_of_inputs_is_refused() -> None:
-    with pytest.raises(SpecificationError, match="not affine"):
-        dataclasses.replace(CRANE, known={"speed": "left + right + 0.1 * left * right"})
-
-
 def test_a_plant_is_a_copy_and_can_be_pickled() -> None:
     constants = {"gain": 5.0}
     plant = dataclasses.replace(MOTOR, constants=constants)
@@ -191,25 +184,6 @@ def test_a_plant_is_a_copy_and_can_be_pickled() -> None:
     again = pickle.loads(pickle.dumps(plant))
     assert again == plant
     assert plant.to_section()["constants"] == again.system(3).plant.constants == {"gain": 5.0}
-
-
-def test_names_of_arguments_may_be_quantities() -> None:
-    plant = Plant(
-        states={"states": "m"},
-        inputs={"inputs": "N"},
-        dt=0.1,
-        gamma=1.0,
-        known={"states": "inputs * constants"},
-        constants={"constants": 2.0},
-        learned=["states"],
-        box={"states": 1.0},
-    )
-    assert plant.system(1).known((0.5,), (0.25,), (2.0,)) == (0.5,)
-
-
-def test_expressions_keep_their_order() -> None:
-    function = compiled_text({"first": "a - b", "second": "2**b"}, {"x": ["a", "b"], "p": []})
-    assert function((5, 3), ()) == (2, 8)
 
 
 full = pytest.mark.parametrize(
@@ -248,6 +222,8 @@ def test_a_low_discrepancy_set_takes_every_midpoint_of_every_axis_once(
     for column, width in zip(grid.T, chain.grid_half_widths, strict=True):
         midpoints = (2 * np.arange(n) + 1 - n) / n * width
         assert np.sort(column) == pytest.approx(midpoints, abs=1e-12)
+    with pytest.raises(SpecificationError, match=r"grid_points is \[1000\], .* to 512 or 1024"):
+        Chain(grid_points=(1000,))
 
 
 def test_a_low_discrepancy_set_is_closer_to_the_mean_over_the_box_than_random_points() -> None:
@@ -259,11 +235,14 @@ def test_a_low_discrepancy_set_is_closer_to_the_mean_over_the_box_than_random_po
     assert abs(np.cos(grid / 3).prod(axis=1).mean() - exact) < 0.1 * np.median(errors)
 
 
-def test_the_number_of_points_of_a_low_discrepancy_set_is_a_power_of_two() -> None:
-    with pytest.raises(
-        SpecificationError, match=r"grid_points is \[1000\], .* set it to 512 or 1024"
-    ):
-        Chain(grid_points=(1000,))
+def test_expressions_keep_their_order_and_arguments_may_be_called_like_quantities() -> None:
+    function = compiled_text({"first": "a - b", "second": "2**b"}, {"x": ["a", "b"], "p": []})
+    assert function((5, 3), ()) == (2, 8)
+    names: dict[str, Any] = {"states": {"states": "m"}, "inputs": {"inputs": "N"}}
+    more: dict[str, Any] = {"constants": {"constants": 2.0}, "box": {"states": 1.0}}
+    known = {"states": "inputs * constants"}
+    plant = Plant(**names, **more, dt=0.1, gamma=1.0, known=known, learned=["states"])
+    assert plant.system(1).known((0.5,), (0.25,), (2.0,)) == (0.5,)
 
 
 EACH_SYSTEM = pytest.mark.parametrize("name", NAMES)
@@ -295,32 +274,28 @@ def test_accelerations_are_affine_in_the_linear_parameters(name: str, data: st.D
 
 
 @EACH_SYSTEM
-def test_the_linear_parameters_can_be_told_apart_on_the_grid(name: str) -> None:
+def test_features_and_linear_parameters_fit_the_grid(name: str) -> None:
+    """Features are of order one there, and the linear parameters can be told apart."""
     system = SYSTEMS[name]()
-    u = np.full(system.n_inputs, system.gamma)
-    psi = np.concatenate([regressors(system, x, u)[1] for x in system.grid()])
+    u, grid = np.full(system.n_inputs, system.gamma), system.grid()
+    psi = np.concatenate([regressors(system, x, u)[1] for x in grid])
     assert np.linalg.matrix_rank(psi) == len(system.linear_parameters)
+    sizes = np.abs(system.featurize(grid)).max(axis=0)
+    assert np.all((sizes > 0.3) & (sizes <= 1.0))
 
 
 @EACH_SYSTEM
 @settings(max_examples=15)
 @given(data=st.data())
-def test_the_input_enters_linearly(name: str, data: st.DataObject) -> None:
-    system, x = data.draw(systems(name)), data.draw(states(name))
-    u, factor = data.draw(inputs(name)), data.draw(st.floats(-3.0, 3.0))
-    rest = system.derivative(x, np.zeros(system.n_inputs))
-    change = system.derivative(x, u) - rest
-    scaled = system.derivative(x, factor * u) - rest
-    assert scaled == pytest.approx(factor * change, abs=1e-10 * (1 + np.abs(rest).max()))
-
-
-@EACH_SYSTEM
-@settings(max_examples=15)
-@given(data=st.data())
-def test_accelerations_depend_on_the_state_through_the_features_alone(
+def test_inputs_enter_linearly_and_states_through_the_features_alone(
     name: str, data: st.DataObject
 ) -> None:
     system, x = data.draw(systems(name)), data.draw(states(name))
+    u, factor = data.draw(inputs(name)), data.draw(st.floats(-3.0, 3.0))
+    zero = np.zeros(system.n_inputs)
+    rest = system.derivative(x, zero)
+    change, scaled = (system.derivative(x, v) - rest for v in (u, factor * u))
+    assert scaled == pytest.approx(factor * change, abs=1e-10 * (1 + np.abs(rest).max()))
     moved = x.copy()
     for index in system.angle_indices:
         moved[index] += 2 * np.pi * data.draw(st.integers(-3, 3))
@@ -332,25 +307,6 @@ def test_accelerations_depend_on_the_state_through_the_features_alone(
     assert phi[1] == pytest.approx(phi[0], abs=1e-13)
     first, second = system.learned(both)
     assert second == pytest.approx(first, abs=1e-9 * (1.0 + np.abs(first).max()))
-
-
-@EACH_SYSTEM
-def test_features_are_of_order_one_on_the_grid(name: str) -> None:
-    system = SYSTEMS[name]()
-    sizes = np.abs(system.featurize(system.grid())).max(axis=0)
-    assert np.all((sizes > 0.3) & (sizes <= 1.0))
-
-
-@EACH_SYSTEM
-@settings(max_examples=10)
-@given(data=st.data())
-def test_one_state_and_many_states_give_the_same_accelerations(
-    name: str, data: st.DataObject
-) -> None:
-    system = data.draw(systems(name))
-    some = np.stack([data.draw(states(name)) for _ in range(3)])
-    for x, row in zip(some, system.learned(some), strict=True):
-        flow = system.derivative(x, np.zeros(system.n_inputs))
-        known = np.array(system.known(tuple(x), (0.0,) * system.n_inputs, system.parameters))
-        rows = list(system.learned_rows)
-        assert (flow - known)[rows] == pytest.approx(row, rel=1e-12, abs=1e-10)
+    # One state and many states give the same.
+    known = np.array(system.known(tuple(x), tuple(zero), system.parameters))
+    assert (rest - known)[list(system.learned_rows)] == pytest.approx(first, rel=1e-12, abs=1e-10)

@@ -13,6 +13,7 @@ import pytest
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import simulate
 from dopt.kernel.from_spec import constants
+from dopt.kernel.run import KernelTrial
 from dopt.registry import section_of
 from dopt.result import TrialResult
 from dopt.run import run_trial
@@ -81,22 +82,8 @@ def test_the_compiled_trial_takes_the_same_steps_and_records_the_cut_inputs() ->
     np.testing.assert_allclose(result.states[1:, 4:6], result.inputs, atol=1e-12)
 
 
-def test_encoders_round_angles_to_counts() -> None:
-    given = trial("arm", "random", 1).to_mapping()
-    spec = TrialSpec.from_mapping({**given, "plant": {"name": "real", "counts": 100}})
-    quantum = 2.0 * math.pi / 100
-    assert spec.system.measured_states == (0, 2)
-    assert spec.system.measurement_noise == pytest.approx([quantum / math.sqrt(12)] * 2)
-    from dopt.kernel.run import KernelTrial
-
-    run = KernelTrial(spec)
-    run.advance(30)
-    outputs, true = run.state.estimate.outputs, run.record.true_states[1:, [0, 2]]
-    np.testing.assert_allclose(outputs, quantum * np.round(true / quantum), atol=1e-12)
-
-
 @pytest.mark.parametrize("learner", ["adam_window", "joint_ekf"])
-def test_estimates_carry_the_inputs_in_flight(learner: str) -> None:
+def test_estimates_of_rounded_angles_carry_the_inputs_in_flight(learner: str) -> None:
     spec = TrialSpec.from_mapping(
         {
             "env": {"name": "pendulum", "horizon": 100, "grid_points": [4, 4]},
@@ -106,8 +93,13 @@ def test_estimates_carry_the_inputs_in_flight(learner: str) -> None:
             "plant": {"name": "real", "counts": 2048, "delay": 2.5},
         }
     )
-    result = run_trial(spec)
-    assert result.loss[-1] < 0.8 * result.loss[0]
+    run, quantum = KernelTrial(spec), 2.0 * math.pi / 2048
+    run.advance(100)
+    outputs, true = run.state.estimate.outputs[:, 0], run.record.true_states[1:, 0]
+    np.testing.assert_allclose(outputs, quantum * np.round(true / quantum), atol=1e-12)
+    assert spec.system.measured_states == (0,)
+    assert spec.system.measurement_noise == pytest.approx([quantum / math.sqrt(12)])
+    assert run.record.loss[-1] < 0.8 * run.record.loss[0]
 
 
 def test_a_section_and_a_pickle_give_the_same_system() -> None:
@@ -131,6 +123,13 @@ def test_defaults_leave_the_system_and_its_key() -> None:
     assert TrialSpec.from_mapping(late.to_mapping()).trial_key == late.trial_key
     assert late.columns()["label"] == f"{spec.columns()['label']}, delay=1"
     assert late.columns()["env"] == "pendulum"
+    for more in (
+        {"model": {"name": "affine"}},
+        {"task": {"name": "control"}},
+        {"path": "reference"},
+    ):
+        with pytest.raises(IncompatibleError):
+            TrialSpec.from_mapping({**late.to_mapping(), **more})
 
 
 @pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
@@ -178,17 +177,6 @@ def test_values_outside_their_bounds_are_refused(hardware: Any, message: str) ->
 def test_what_does_not_go_together_is_refused(system: System, hardware: Any, message: str) -> None:
     with pytest.raises(IncompatibleError, match=message):
         Real(system, **hardware)
-
-
-def test_models_that_read_inputs_tasks_and_torch_go_without() -> None:
-    late = {**trial("pendulum", "d_optimal").to_mapping(), "plant": {"name": "real", "delay": 1}}
-    for more in (
-        {"model": {"name": "affine"}},
-        {"task": {"name": "control"}},
-        {"path": "reference"},
-    ):
-        with pytest.raises(IncompatibleError):
-            TrialSpec.from_mapping({**late, **more})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,9 +19,8 @@ from pathlib import Path
 import pytest
 
 from dopt.result import Assessment
-from orchestrate.__main__ import main
-from orchestrate.commands import COMMANDS
-from orchestrate.commands.command import Command
+from orchestrate.__main__ import COMMANDS, main
+from orchestrate.commands import Command
 from orchestrate.errors import ExitCode
 from orchestrate.program import Parser
 from orchestrate.store import Store

@@ -17,8 +17,7 @@ from rich.console import Console
 from analysis.cli import main as analysis
 from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import main
-from orchestrate.commands import status
-from orchestrate.commands.command import plain
+from orchestrate.commands import plain, status
 from orchestrate.commands.results import Status, gather, grid_table
 from orchestrate.commands.status import watch
 from orchestrate.executors.base import Event, InProcessExecutor, Task
@@ -323,7 +322,7 @@ def test_what_programs_read_stays_exact(evil: str, command: Callable[..., Answer
 
 
 def test_colours_of_the_program_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrate.commands.command import console
+    from orchestrate.commands import console
 
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")

@@ -28,20 +28,20 @@ def shared_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     import ray
 
-    from orchestrate.executors.ray.executor import OwnRay
+    from orchestrate.executors.ray import executor
 
-    start = OwnRay._init
+    start = executor._init
 
     def start_once(address: str, **options: Any) -> None:
         if not ray.is_initialized():
             leave_services_out()
             start(address, **{**options, "num_cpus": WORKERS})
 
-    def disconnect(_: OwnRay, *, lost: bool) -> None:
+    def disconnect(_: executor.OwnRay, *, lost: bool) -> None:
         assert not lost
 
-    monkeypatch.setattr(OwnRay, "_init", staticmethod(start_once))
-    monkeypatch.setattr(OwnRay, "disconnect", disconnect)
+    monkeypatch.setattr(executor, "_init", start_once)
+    monkeypatch.setattr(executor.OwnRay, "disconnect", disconnect)
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.executors import local
 from orchestrate.runner import scheduler, start, worker
 from orchestrate.runner.start import Output, Work
-from orchestrate.runner.worker import WorkerSettings, run_worker
+from orchestrate.runner.worker import run_worker
 from orchestrate.store import Store, StoreUnavailableError
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
@@ -137,9 +137,9 @@ def _pull(order: Order, work: Work) -> int:
     if order.tick:
         clock = Clock(Gate(Path(order.gate)), order.tick)
         worker.time = worker.time = clock  # type: ignore[assignment]
-    settings = WorkerSettings(order.url, **{"processes": 2, **dict(order.worker or {})})
+    settings = {"processes": 2, **dict(order.worker or {})}
     try:
-        return run_worker(settings, Output(start.say, start.say, sys.stderr), work)
+        return run_worker(order.url, Output(start.say, start.say, sys.stderr), work, **settings)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except StoreUnavailableError as error:

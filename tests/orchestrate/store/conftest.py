@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrate.store import Claim, Reader, Store
+from orchestrate.store.records import Curves
 from tests.orchestrate.store.databases import new_schema
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 from tests.orchestrate.store.released import VERSIONS, restore
@@ -58,6 +61,38 @@ def take(store: Store, launch: int) -> Callable[..., list[Claim]]:
         return store.claim(launch, store.register(launch, specs).todo)
 
     return register_and_claim
+
+
+@dataclass(frozen=True)
+class Database:
+    """One database, a store that writes to it, and a launch that has begun there."""
+
+    url: str
+    store: Store
+    launch: int
+    _request: pytest.FixtureRequest
+
+    @property
+    def reader(self) -> Reader:
+        """Reader, which is opened when it is first asked for."""
+        reader: Reader = self._request.getfixturevalue("reader")
+        return reader
+
+    def take(self, *specs: Spec) -> list[Claim]:
+        """Register and claim the given trials."""
+        return self.store.claim(self.launch, self.store.register(self.launch, specs).todo)
+
+    def rows(self, sql: str) -> list[tuple[Any, ...]]:
+        return [tuple(row) for row in self.reader.rows(sql)]
+
+    def curves(self, value: str = "loss") -> Curves:
+        """Return the curves of the usual configuration."""
+        return self.reader.curves(Spec().config_key, value)
+
+
+@pytest.fixture
+def db(request: pytest.FixtureRequest, url: str, store: Store, launch: int) -> Database:
+    return Database(url, store, launch, request)
 
 
 each_version = pytest.mark.parametrize("version", VERSIONS, indirect=True)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.result import Assessment
-from orchestrate.store import Claim, LaunchRecord, Reader, RunRecord, Store
+from orchestrate.store import Claim, Failure, LaunchRecord, Reader, RunRecord, Store
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +38,7 @@ RUN = RunRecord(
     started=MOMENT,
     ended=MOMENT,
 )
+FAILURE = Failure("ValueError", "no", "Traceback: no")
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,11 @@ from typing import Any
 
 import sqlalchemy
 
-from orchestrate.store import Claim, Store
+from orchestrate.store import Store
 from orchestrate.store import maintenance as migration
-from orchestrate.store import merge as merge_source
 from orchestrate.store import merge as merging
 from orchestrate.store.maintenance import upgrade
-from orchestrate.store.merge import merge
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
 from tests.waiting import PATIENCE_SECONDS
 
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
@@ -84,49 +82,17 @@ def eight_open(urls: Sequence[str]) -> None:
         assert answers == ["opened"] * 8, answers
 
 
-def hold_claims(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:
+def hold_claims(pipe: Pipe, url: str, n: int) -> None:
     """Claim n trials, tell which, and do nothing more."""
-    with Store.open(url, lease_seconds=lease_seconds) as store:
-        pipe.send(_claims(store, n))
+    with Store.open(url) as store:
+        pipe.send(begin(store, *map(Spec, range(n)))[1])
         pipe.recv()
-
-
-def die_in_commit(pipe: Pipe, url: str, lease_seconds: float = 60.0) -> None:
-    """Commit one trial, then stop for ever with half of the next one's steps written."""
-    store = Store.open(url, lease_seconds=lease_seconds)
-    first, second = _claims(store, 2)
-    store.commit(first, result(first.trial_id), RUN)
-    backend = store._backend
-    insert_steps = backend.insert_steps
-
-    def half(connection: sqlalchemy.Connection, trial_id: int, values: Array) -> None:
-        insert_steps(connection, trial_id, values[: HORIZON // 2])
-        pipe.send("half")
-        time.sleep(PATIENCE_SECONDS)
-
-    backend.insert_steps = half  # type: ignore[method-assign]
-    store.commit(second, result(second.trial_id), RUN)
-
-
-def run_grid(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:
-    """Run a grid of n trials, one claim and one commit at a time; tell how many were mine."""
-    with Store.open(url, lease_seconds=lease_seconds) as store:
-        launch = store.begin_launch(LAUNCH)
-        keys = store.register(launch, [Spec(seed) for seed in range(n)]).todo
-        pipe.send("ready")
-        pipe.recv()
-        mine = 0
-        for key in keys:
-            for claim in store.claim(launch, [key]):
-                mine += store.commit(claim, result(claim.trial_id), RUN)
-        store.end_launch(launch, "done")
-        pipe.send(mine)
 
 
 def run_and_stop(pipe: Pipe, url: str, n: int) -> None:
     """Commit n trials of a grid of twice as many, one at a time, and stop for ever."""
     store = Store.open(url)
-    for claim in _claims(store, 2 * n)[:n]:
+    for claim in begin(store, *map(Spec, range(2 * n)))[1][:n]:
         store.commit(claim, result(claim.trial_id), RUN)
     pipe.send("committed")
     time.sleep(PATIENCE_SECONDS)
@@ -160,7 +126,7 @@ def upgrade_and_tell(pipe: Pipe, url: str, barrier: Barrier | None, stops: bool 
 
 def merge_and_tell(pipe: Pipe, url: str, other: str, after: int) -> None:
     """Merge with pages of three trials, and stop for ever before the given one."""
-    merge_source.PAGE = 3
+    merging.PAGE = 3
     add = merging.Target.add
     count = 0
 
@@ -173,9 +139,4 @@ def merge_and_tell(pipe: Pipe, url: str, other: str, after: int) -> None:
         add(*arguments)
 
     merging.Target.add = stop  # type: ignore[method-assign]
-    merge(url, other)
-
-
-def _claims(store: Store, n: int) -> list[Claim]:
-    launch = store.begin_launch(LAUNCH)
-    return store.claim(launch, store.register(launch, [Spec(seed) for seed in range(n)]).todo)
+    merging.merge(url, other)

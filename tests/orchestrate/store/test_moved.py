@@ -14,8 +14,8 @@ from sqlalchemy import make_url
 
 from orchestrate.errors import StoreError
 from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store
-from orchestrate.store.backends import sqlite, sqlite_engine
-from orchestrate.store.backends.sqlite_engine import is_network, mount_of
+from orchestrate.store.backends import sqlite
+from orchestrate.store.backends.sqlite import is_network, mount_of
 from orchestrate.store.maintenance import upgrade
 from orchestrate.store.merge import merge
 from orchestrate.store.store import make_backend
@@ -351,7 +351,7 @@ def test_a_database_on_a_network_is_refused_before_anything_is_written(
 ) -> None:
     table = tmp_path / "mountinfo"
     table.write_text(f"{ROOT}60 29 0:50 / {tmp_path}/home rw - nfs4 nas:/home rw\n")
-    monkeypatch.setattr(sqlite_engine, "MOUNT_TABLE", table)
+    monkeypatch.setattr(sqlite, "MOUNT_TABLE", table)
     (tmp_path / "link").symlink_to(tmp_path / "home", target_is_directory=True)
     url = make_url(f"sqlite:///{tmp_path}/link/results/results.db")
     with pytest.raises(StoreError, match=r"home, whose file system \(nfs4\).*store=postgresql"):
@@ -363,5 +363,5 @@ def test_a_database_on_a_network_is_refused_before_anything_is_written(
 def test_nothing_is_refused_where_there_is_no_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite_engine, "MOUNT_TABLE", tmp_path / "none")
+    monkeypatch.setattr(sqlite, "MOUNT_TABLE", tmp_path / "none")
     make_backend(make_url(f"sqlite:///{tmp_path}/results.db")).close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 
@@ -14,19 +13,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from dopt.result import Assessment
-from orchestrate.store import (
-    Claim,
-    Failure,
-    InvalidResultError,
-    Reader,
-    Store,
-    StoreUnavailableError,
-)
+from orchestrate.store import Failure, InvalidResultError, Reader, Store, StoreUnavailableError
 from orchestrate.store.maintenance import examine, upgrade
 from orchestrate.store.records import DTYPE, finite_list, pack, unpack, utc_text
 from orchestrate.store.schema import STEP_VALUES
+from tests.orchestrate.store.conftest import Database
 from tests.orchestrate.store.databases import execute
 from tests.orchestrate.store.fakes import (
+    FAILURE,
     HORIZON,
     LAUNCH,
     RUN,
@@ -38,185 +32,155 @@ from tests.orchestrate.store.fakes import (
     result,
 )
 
-Take = Callable[..., list[Claim]]
+KEY = Spec().config_key
 
 
-class TestCommit:
-    def test_gives_back_every_number(self, store: Store, take: Take, reader: Reader) -> None:
-        (claim,) = take(Spec())
-        sent = result()
-        assert store.commit(claim, sent, RUN)
-        for name in ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us"):
-            curves = reader.curves(Spec().config_key, name)
-            np.testing.assert_array_equal(curves.values, [getattr(sent, name)], strict=True)
-        arrays = reader.trajectory(Spec().config_key, 0)
-        for name in ("states", "inputs", "parameters"):
-            np.testing.assert_array_equal(getattr(arrays, name), getattr(sent, name), strict=True)
+# Commits
 
-    def test_gives_the_final_losses_of_trials_that_are_done(self, store: Store, take: Take) -> None:
-        specs = [Spec(seed) for seed in range(4)]
-        whole, lost, failed, _ = take(*specs)
-        store.commit(whole, result(), RUN)
-        store.commit(lost, diverged(at=3), RUN)
-        store.fail(failed, Failure("ZeroDivisionError", "no", "here"), RUN)
-        keys = [spec.trial_key for spec in specs]
-        assert store.final_losses(keys) == {whole.trial_key: result().loss[-1]}
-        assert store.final_losses(keys[1:]) == store.final_losses([]) == {}
 
-    def test_gives_back_the_assessments(self, store: Store, take: Take, reader: Reader) -> None:
-        for claim, seed in zip(take(Spec(0), Spec(1)), (0, 1), strict=True):
-            assert store.commit(claim, assessed(seed), RUN)
-        rows = [row for seed in (0, 1) for row in assessed(seed).assessments]
-        found = reader.assessments(Spec().config_key, "cost")
-        assert (found.seeds.tolist(), found.t.tolist()) == ([0, 1], [0, 3, 7])
-        costs = [row.value for row in rows if row.measure == "cost"]
-        assert found.values.ravel().tolist() == costs
-        errors = reader.assessments(Spec().config_key, "error").values
-        assert np.isnan(errors[:, 2]).all()
-        assert np.isfinite(errors[:, :2]).all()
-        assert reader.rows("SELECT count(*) FROM assessment WHERE value IS NULL") == [(2,)]
-        assert reader.measures(Spec().config_key) == ["cost", "error"]
-        assert reader.assessments(Spec().config_key, "nothing").values.shape == (0, 0)
+def test_a_commit_gives_back_every_number_and_its_summary(db: Database) -> None:
+    (claim,) = db.take(Spec())
+    sent, later = result(), datetime(2126, 1, 31, 12, 0, 0, 250, tzinfo=UTC)
+    assert db.store.commit(claim, sent, replace(RUN, started=later, ended=later))
+    for name in STEP_VALUES:
+        np.testing.assert_array_equal(db.curves(name).values, [getattr(sent, name)], strict=True)
+    arrays = db.reader.trajectory(KEY, 0)
+    for name in ("states", "inputs", "parameters"):
+        np.testing.assert_array_equal(getattr(arrays, name), getattr(sent, name), strict=True)
+    (row,) = db.reader.trials(KEY)
+    assert (row.status, row.n_steps, row.diverged_at) == ("done", HORIZON, None)
+    assert (row.final_loss, row.best_loss) == (sent.final_loss, sent.best_loss)
+    assert (row.wall_seconds, row.cpu_seconds) == (RUN.wall_seconds, RUN.cpu_seconds)
+    assert (row.peak_memory_bytes, row.node, row.launch) == (2**33, "here", db.launch)
+    assert db.rows("SELECT owner FROM trial") == [(None,)]
+    assert db.rows("SELECT outcome, pid, started, launch_id FROM attempt") == [
+        ("done", 18, "2126-01-31T12:00:00.000250Z", db.launch)
+    ]
 
-    @pytest.mark.parametrize(
-        ("row", "words"),
-        [
-            (Assessment(8, "cost", 1.0), "'cost' is of step 8, expected one from 0 to 7"),
-            (Assessment(3, "cost", 1.0), "'cost' of step 3 is given twice"),
-        ],
-    )
-    def test_refuses_assessments_that_do_not_fit(
-        self, store: Store, take: Take, reader: Reader, row: Assessment, words: str
-    ) -> None:
-        (claim,) = take(Spec())
+
+def test_final_losses_are_of_trials_that_are_done(db: Database) -> None:
+    specs = [Spec(seed) for seed in range(4)]
+    whole, lost, failed, _ = db.take(*specs)
+    db.store.commit(whole, result(), RUN)
+    db.store.commit(lost, diverged(at=3), RUN)
+    db.store.fail(failed, FAILURE, RUN)
+    keys = [spec.trial_key for spec in specs]
+    assert db.store.final_losses(keys) == {whole.trial_key: result().loss[-1]}
+    assert db.store.final_losses(keys[1:]) == db.store.final_losses([]) == {}
+
+
+def test_assessments_come_back_and_others_are_refused(db: Database) -> None:
+    one, two = db.take(Spec(0), Spec(1))
+    for row, words in (
+        (Assessment(8, "cost", 1.0), "'cost' is of step 8, expected one from 0 to 7"),
+        (Assessment(3, "cost", 1.0), "'cost' of step 3 is given twice"),
+    ):
         sent = replace(assessed(), assessments=(*assessed().assessments, row))
         with pytest.raises(InvalidResultError, match=words):
-            store.commit(claim, sent, RUN)
-        assert reader.rows("SELECT * FROM assessment") == []
+            db.store.commit(one, sent, RUN)
+        assert db.rows("SELECT * FROM assessment") == []
+    for claim, seed in ((one, 0), (two, 1)):
+        assert db.store.commit(claim, assessed(seed), RUN)
+    rows = [row for seed in (0, 1) for row in assessed(seed).assessments]
+    found = db.reader.assessments(KEY, "cost")
+    assert (found.seeds.tolist(), found.t.tolist()) == ([0, 1], [0, 3, 7])
+    assert found.values.ravel().tolist() == [row.value for row in rows if row.measure == "cost"]
+    errors = db.reader.assessments(KEY, "error").values
+    assert np.isnan(errors).tolist() == [[False, False, True]] * 2
+    assert db.rows("SELECT count(*) FROM assessment WHERE value IS NULL") == [(2,)]
+    assert db.reader.measures(KEY) == ["cost", "error"]
+    assert db.reader.assessments(KEY, "nothing").values.shape == (0, 0)
 
-    @pytest.mark.parametrize("horizon", [1, 99, 100, 101, 250])
-    def test_numbers_the_steps(
-        self, store: Store, take: Take, reader: Reader, horizon: int
-    ) -> None:
-        (claim,) = take(Spec(horizon=horizon))
+
+def test_a_commit_numbers_the_steps_up_to_the_horizon_of_its_configuration(db: Database) -> None:
+    horizons = (1, 99, 100, 101, 250)
+    claims = db.take(*(Spec(horizon=horizon) for horizon in horizons))
+    with pytest.raises(InvalidResultError, match="99 steps, expected the horizon 100"):
+        db.store.commit(claims[2], result(horizon=99), RUN)
+    for claim, horizon in zip(claims, horizons, strict=True):
         sent = result(horizon=horizon)
-        store.commit(claim, sent, RUN)
-        rows = reader.rows("SELECT t, evaluate_us FROM step ORDER BY t")
-        assert [row.t for row in rows] == list(range(horizon))
-        assert [row.evaluate_us for row in rows] == sent.evaluate_us.tolist()
-
-    def test_knows_the_horizon_of_each_configuration(self, store: Store, take: Take) -> None:
-        long, short = take(Spec(horizon=20), Spec(horizon=10))
-        with pytest.raises(InvalidResultError, match="20 steps, expected the horizon 10"):
-            store.commit(short, result(horizon=20), RUN)
-        assert store.commit(short, result(horizon=10), RUN)
-        assert store.commit(long, result(horizon=20), RUN)
-
-    def test_writes_the_summary(
-        self, store: Store, launch: int, take: Take, reader: Reader
-    ) -> None:
-        (claim,) = take(Spec())
-        sent, later = result(), datetime(2126, 1, 31, 12, 0, 0, 250, tzinfo=UTC)
-        store.commit(claim, sent, replace(RUN, started=later, ended=later))
-        (row,) = reader.trials(Spec().config_key)
-        assert (row.status, row.n_steps, row.diverged_at) == ("done", HORIZON, None)
-        assert (row.final_loss, row.best_loss) == (sent.final_loss, sent.best_loss)
-        assert (row.wall_seconds, row.cpu_seconds) == (RUN.wall_seconds, RUN.cpu_seconds)
-        assert (row.peak_memory_bytes, row.node, row.launch) == (2**33, "here", launch)
-        assert reader.rows("SELECT owner FROM trial")[0].owner is None
-        (attempt,) = reader.rows("SELECT outcome, pid, started, launch_id FROM attempt")
-        assert tuple(attempt) == ("done", 18, "2126-01-31T12:00:00.000250Z", launch)
-
-    @pytest.mark.parametrize("fate", ["done", "failed", "released", "lost", "saved"])
-    def test_no_end_stands_before_a_beginning(
-        self, store: Store, launch: int, take: Take, reader: Reader, url: str, fate: str
-    ) -> None:
-        """The clocks of two machines differ, or one was set back, by hours."""
-        (claim,) = take(Spec())
-        ahead = "2126-01-31T12:00:00.000000Z"
-        execute(url, f"UPDATE attempt SET claimed = '{ahead}'")
-        execute(url, f"UPDATE launch SET started = '{ahead}'")
-        if fate == "done":
-            assert store.commit(claim, result(), RUN)
-        elif fate == "failed":
-            backwards = replace(RUN, ended=RUN.started - timedelta(hours=1))
-            assert store.fail(claim, Failure("E", "m", "t"), backwards)
-        elif fate == "released":
-            assert store.release(launch) == 1
-        elif fate == "saved":
-            store.release(launch)
-            assert store.save(launch, Spec(), result(), RUN)
-        store.end_launch(launch, "lost" if fate == "lost" else "done")
-        for row in reader.rows("SELECT claimed, started, ended FROM attempt"):
-            assert row.claimed <= (row.started or row.claimed) <= row.ended
-        (row,) = reader.rows("SELECT started, ended FROM launch")
-        assert row.started <= row.ended
-
-    def test_keeps_a_divergence_as_null(self, store: Store, take: Take, reader: Reader) -> None:
-        kinds = [(at, value) for at in (0, 3) for value in (np.nan, np.inf, -np.inf)]
-        for claim, (at, value) in zip(take(*map(Spec, range(6))), kinds, strict=True):
-            assert store.commit(claim, diverged(at, value=value), RUN)
-        rows = reader.rows(
-            "SELECT count(*), count(loss), count(plan_us) FROM step GROUP BY trial_id ORDER BY 1, 2"
-        )
-        assert [tuple(row) for row in rows] == [(HORIZON, at, at) for at in (0, 0, 0, 3, 3, 3)]
-        trials = reader.trials(Spec().config_key)
-        assert {trial.status for trial in trials} == {"diverged"}
-        assert [(one.diverged_at, one.n_steps) for one in trials] == [(at, at) for at, _ in kinds]
-        assert {trial.final_loss for trial in trials} == {None}
-
-    def test_takes_numpy_scalars(self, store: Store, take: Take, reader: Reader) -> None:
-        (claim,) = take(Spec())
-        sent = replace(diverged(3), diverged_at=np.int64(3), n_steps=np.int32(3))  # type: ignore[arg-type]
-        run = replace(RUN, pid=np.int64(1), peak_memory_bytes=np.int64(5))  # type: ignore[arg-type]
-        assert store.commit(claim, sent, run)
-        (row,) = reader.rows("SELECT seed FROM trial WHERE diverged_at = 3 AND n_steps = 3")
-        assert row.seed == 0
-
-    def test_of_many_is_one_for_each(self, store: Store, take: Take, reader: Reader) -> None:
-        claims = take(*(Spec(seed) for seed in range(3)))
-        items = [(claim, result(claim.trial_id), RUN) for claim in reversed(claims)]
-        late = (replace(claims[0], attempt=9), result(), RUN)
-        assert store.commit_many([items[0], late, *items[1:]]) == [True, False, True, True]
-        expected = [result(claim.trial_id).loss for claim in claims]
-        np.testing.assert_array_equal(reader.curves(Spec().config_key).values, expected)
+        assert db.store.commit(claim, sent, RUN)
+        steps = f"SELECT t, evaluate_us FROM step WHERE trial_id = {claim.trial_id} ORDER BY t"
+        assert db.rows(steps) == list(enumerate(sent.evaluate_us.tolist()))
 
 
-class TestFence:
-    def test_refuses_a_doubled_commit(self, store: Store, take: Take, reader: Reader) -> None:
-        (claim,) = take(Spec())
-        assert store.commit(claim, result(1), RUN)
-        assert not store.commit(claim, result(2), RUN)
-        assert not store.fail(claim, Failure("E", "m", "t"), RUN)
-        np.testing.assert_array_equal(reader.curves(Spec().config_key).values[0], result(1).loss)
+@pytest.mark.parametrize("fate", ["done", "failed", "released", "lost", "saved"])
+def test_no_end_stands_before_a_beginning(db: Database, fate: str) -> None:
+    """The clocks of two machines differ, or one was set back, by hours."""
+    (claim,) = db.take(Spec())
+    ahead = "2126-01-31T12:00:00.000000Z"
+    execute(db.url, f"UPDATE attempt SET claimed = '{ahead}'")
+    execute(db.url, f"UPDATE launch SET started = '{ahead}'")
+    if fate == "done":
+        assert db.store.commit(claim, result(), RUN)
+    elif fate == "failed":
+        backwards = replace(RUN, ended=RUN.started - timedelta(hours=1))
+        assert db.store.fail(claim, FAILURE, backwards)
+    elif fate in ("released", "saved"):
+        assert db.store.release(db.launch) == 1
+    if fate == "saved":
+        assert db.store.save(db.launch, Spec(), result(), RUN)
+    db.store.end_launch(db.launch, "lost" if fate == "lost" else "done")
+    for claimed, started, ended in db.rows("SELECT claimed, started, ended FROM attempt"):
+        assert claimed <= (started or claimed) <= ended
+    [(started, ended)] = db.rows("SELECT started, ended FROM launch")
+    assert started <= ended
 
-    @pytest.mark.parametrize("again", ["same launch", "other launch"])
-    def test_refuses_a_late_commit(
-        self, store: Store, launch: int, take: Take, reader: Reader, again: str
-    ) -> None:
-        (late,) = take(Spec())
-        store.release(launch)
-        owner = launch if again == "same launch" else store.begin_launch(LAUNCH)
-        (claim,) = store.claim(owner, [late.trial_key])
-        assert not store.commit(late, assessed(1), RUN)
-        assert reader.rows("SELECT * FROM step") == []
-        assert reader.rows("SELECT * FROM assessment") == []
-        assert store.commit(claim, result(2), RUN)
-        np.testing.assert_array_equal(reader.curves(Spec().config_key).values[0], result(2).loss)
 
-    def test_refuses_a_late_failure(
-        self, store: Store, launch: int, take: Take, reader: Reader
-    ) -> None:
-        (late,) = take(Spec())
-        store.release(launch)
-        assert not store.fail(late, Failure("E", "m", "t"), RUN)
-        assert reader.rows("SELECT * FROM error") == []
-        assert reader.trials(Spec().config_key)[0].status == "pending"
+def test_a_divergence_is_kept_as_null(db: Database) -> None:
+    kinds = [(at, value) for at in (0, 3) for value in (np.nan, np.inf, -np.inf)]
+    for claim, (at, value) in zip(db.take(*map(Spec, range(6))), kinds, strict=True):
+        assert db.store.commit(claim, diverged(at, value=value), RUN)
+    counts = "SELECT count(*), count(loss), count(plan_us) FROM step GROUP BY trial_id"
+    assert sorted(db.rows(counts)) == [(HORIZON, at, at) for at, _ in kinds]
+    trials = db.reader.trials(KEY)
+    assert {(trial.status, trial.final_loss) for trial in trials} == {("diverged", None)}
+    assert [(one.diverged_at, one.n_steps) for one in trials] == [(at, at) for at, _ in kinds]
 
-    def test_refuses_a_claim_of_somebody_else(self, store: Store, take: Take) -> None:
-        (claim,) = take(Spec())
-        forged = replace(claim, launch=store.begin_launch(LAUNCH))
-        assert not store.commit(forged, result(), RUN)
+
+def test_a_commit_takes_numpy_scalars(db: Database) -> None:
+    (claim,) = db.take(Spec())
+    sent = replace(diverged(3), diverged_at=np.int64(3), n_steps=np.int32(3))  # type: ignore[arg-type]
+    run = replace(RUN, pid=np.int64(1), peak_memory_bytes=np.int64(5))  # type: ignore[arg-type]
+    assert db.store.commit(claim, sent, run)
+    assert db.rows("SELECT seed FROM trial WHERE diverged_at = 3 AND n_steps = 3") == [(0,)]
+
+
+def test_a_commit_of_many_is_one_for_each(db: Database) -> None:
+    claims = db.take(*(Spec(seed) for seed in range(3)))
+    items = [(claim, result(claim.trial_id), RUN) for claim in reversed(claims)]
+    late = (replace(claims[0], attempt=9), result(), RUN)
+    assert db.store.commit_many([items[0], late, *items[1:]]) == [True, False, True, True]
+    expected = [result(claim.trial_id).loss for claim in claims]
+    np.testing.assert_array_equal(db.curves().values, expected)
+
+
+# The fence
+
+
+def test_a_doubled_commit_and_a_claim_of_somebody_else_are_refused(db: Database) -> None:
+    (claim,) = db.take(Spec())
+    forged = replace(claim, launch=db.store.begin_launch(LAUNCH))
+    assert not db.store.commit(forged, result(), RUN)
+    assert db.store.commit(claim, result(1), RUN)
+    assert not db.store.commit(claim, result(2), RUN)
+    assert not db.store.fail(claim, FAILURE, RUN)
+    np.testing.assert_array_equal(db.curves().values[0], result(1).loss)
+
+
+@pytest.mark.parametrize("again", ["same launch", "other launch"])
+def test_a_late_outcome_is_refused(db: Database, again: str) -> None:
+    (late,) = db.take(Spec())
+    db.store.release(db.launch)
+    assert not db.store.fail(late, FAILURE, RUN)
+    assert db.reader.trials(KEY)[0].status == "pending"
+    owner = db.launch if again == "same launch" else db.store.begin_launch(LAUNCH)
+    (claim,) = db.store.claim(owner, [late.trial_key])
+    assert not db.store.commit(late, assessed(1), RUN)
+    for table in ("step", "assessment", "error"):
+        assert db.rows(f"SELECT * FROM {table}") == []
+    assert db.store.commit(claim, result(2), RUN)
+    np.testing.assert_array_equal(db.curves().values[0], result(2).loss)
 
 
 def _with_hole() -> FakeResult:
@@ -237,93 +201,73 @@ MALFORMED = {
 }
 
 
-class TestMalformedResult:
-    def test_is_refused_whole(self, store: Store, take: Take, reader: Reader) -> None:
-        good, bad = take(Spec(0), Spec(1))
-        for reason, malformed in MALFORMED.items():
-            with pytest.raises(InvalidResultError, match=reason):
-                store.commit_many([(good, result(), RUN), (bad, malformed, RUN)])
-            assert reader.rows("SELECT * FROM step") == []
-        assert store.commit(bad, result(), RUN)
-
-    def test_needs_times_with_a_zone(self, store: Store, take: Take) -> None:
-        (claim,) = take(Spec())
-        local = replace(RUN, started=datetime(2026, 1, 1))
-        with pytest.raises(ValueError, match="no time zone"):
-            store.commit(claim, result(), local)
+def test_a_malformed_result_is_refused_whole(db: Database) -> None:
+    good, bad = db.take(Spec(0), Spec(1))
+    for reason, malformed in MALFORMED.items():
+        with pytest.raises(InvalidResultError, match=reason):
+            db.store.commit_many([(good, result(), RUN), (bad, malformed, RUN)])
+        assert db.rows("SELECT * FROM step") == []
+    with pytest.raises(ValueError, match="no time zone"):
+        db.store.commit(bad, result(), replace(RUN, started=datetime(2026, 1, 1)))
+    assert db.store.commit(bad, result(), RUN)
 
 
-class TestFailure:
-    def test_is_written_down_once_for_each_cause(
-        self, store: Store, take: Take, reader: Reader
-    ) -> None:
-        for claim in take(*(Spec(seed) for seed in range(3))):
-            assert store.fail(claim, Failure("ValueError", "no", "Traceback", "timeout"), RUN)
-        assert len(reader.rows("SELECT * FROM error")) == 1
-        rows = reader.rows("SELECT seed, cause, type, message, traceback FROM v_failures")
-        assert sorted(tuple(row) for row in rows) == [
-            (seed, "timeout", "ValueError", "no", "Traceback") for seed in range(3)
-        ]
-        (first, *_) = reader.trials(Spec().config_key)
-        assert (first.status, first.error_type, first.node) == ("failed", "ValueError", "here")
+# Failures
 
-    def test_stays_in_the_history_of_a_trial(
-        self, store: Store, take: Take, reader: Reader
-    ) -> None:
-        (claim,) = take(Spec())
-        store.fail(claim, Failure("E", "m", "t"), RUN)
-        store.retry("failed")
-        (again,) = take(Spec())
-        store.commit(again, result(), RUN)
-        rows = reader.rows("SELECT attempt, outcome FROM attempt ORDER BY attempt")
-        assert [tuple(row) for row in rows] == [(1, "failed"), (2, "done")]
-        assert reader.rows("SELECT status FROM v_failures")[0].status == "done"
-        assert reader.trials(Spec().config_key)[0].error_type is None
 
-    def test_may_say_what_no_database_takes(self, store: Store, take: Take, reader: Reader) -> None:
-        (claim,) = take(Spec())
-        text = "a zero \0 and the name of a file, \udcff"
-        assert store.fail(claim, Failure("OSError", text, f"Traceback\n{text}"), RUN)
-        (row,) = reader.rows("SELECT message, traceback FROM v_failures")
-        assert row.message == r"a zero \x00 and the name of a file, \udcff"
-        assert row.traceback == f"Traceback\n{row.message}"
+def test_a_failure_is_written_down_once_for_each_cause(db: Database) -> None:
+    for claim in db.take(*(Spec(seed) for seed in range(3))):
+        assert db.store.fail(claim, Failure("ValueError", "no", "Traceback", "timeout"), RUN)
+    assert len(db.rows("SELECT * FROM error")) == 1
+    assert sorted(db.rows("SELECT seed, cause, type, message, traceback FROM v_failures")) == [
+        (seed, "timeout", "ValueError", "no", "Traceback") for seed in range(3)
+    ]
+    (first, *_) = db.reader.trials(KEY)
+    assert (first.status, first.error_type, first.node) == ("failed", "ValueError", "here")
 
+
+def test_a_failure_stays_in_the_history_of_a_trial(db: Database) -> None:
+    (claim,) = db.take(Spec())
+    text = "a zero \0 and the name of a file, \udcff"
+    assert db.store.fail(claim, Failure("OSError", text, f"Traceback\n{text}"), RUN)
+    shown = r"a zero \x00 and the name of a file, \udcff"
+    failures = "SELECT message, traceback, status FROM v_failures"
+    assert db.rows(failures) == [(shown, f"Traceback\n{shown}", "failed")]
+    db.store.retry("failed")
+    db.store.commit(*db.take(Spec()), result(), RUN)
+    rows = db.rows("SELECT attempt, outcome FROM attempt ORDER BY attempt")
+    assert rows == [(1, "failed"), (2, "done")]
+    assert db.rows(failures)[0][2] == "done"
+    assert db.reader.trials(KEY)[0].error_type is None
+
+
+# Curves as arrays beside the steps
 
 SEEDS = range(4)
 
 
 @pytest.fixture
-def finished(store: Store, take: Take) -> list[Spec]:
-    """Return done trials of one configuration, and a diverged one."""
-    specs = [Spec(seed) for seed in SEEDS]
-    for spec, claim in zip(specs, take(*specs), strict=True):
-        store.commit(claim, diverged(3) if spec.seed == 2 else result(spec.seed), RUN)
-    return specs
+def finished(db: Database) -> Database:
+    """Return a database with done trials of one configuration, and a diverged one."""
+    for seed, claim in zip(SEEDS, db.take(*map(Spec, SEEDS)), strict=True):
+        db.store.commit(claim, diverged(3) if seed == 2 else result(seed), RUN)
+    return db
 
 
-def matrices(reader: Reader) -> list[np.ndarray]:
-    return [reader.curves(Spec().config_key, name).values for name in STEP_VALUES]
+def matrices(db: Database) -> list[Array]:
+    return [db.curves(name).values for name in STEP_VALUES]
 
 
-def stored_once(reader: Reader) -> list[np.ndarray]:
-    rows = reader.rows(
-        f"SELECT {', '.join(STEP_VALUES)} FROM step JOIN trial USING (trial_id) ORDER BY seed, t"
-    )
-    numbers = np.array([tuple(row) for row in rows], dtype=np.float64)
-    return [column.reshape(len(SEEDS), -1) for column in numbers.T]
-
-
-def test_they_are_the_numbers_of_the_steps(finished: list[Spec], reader: Reader) -> None:
-    assert len(reader.rows("SELECT * FROM curve")) == len(finished)
-    for packed, steps in zip(matrices(reader), stored_once(reader), strict=True):
-        np.testing.assert_array_equal(packed, steps)
-
-
-def test_no_step_is_read_where_they_are(finished: list[Spec], reader: Reader, url: str) -> None:
-    before = matrices(reader)
-    execute(url, "DELETE FROM step")
-    np.testing.assert_array_equal(matrices(reader), before)
-    assert len(before[0]) == len(finished)
+def test_arrays_are_the_numbers_of_the_steps_and_are_read_in_their_place(
+    finished: Database,
+) -> None:
+    assert finished.rows("SELECT count(*) FROM curve") == [(len(SEEDS),)]
+    names = ", ".join(STEP_VALUES)
+    rows = finished.rows(f"SELECT {names} FROM step JOIN trial USING (trial_id) ORDER BY seed, t")
+    steps = np.array(rows, dtype=np.float64).T.reshape(len(STEP_VALUES), len(SEEDS), -1)
+    np.testing.assert_array_equal(matrices(finished), steps)
+    execute(finished.url, "DELETE FROM step")
+    np.testing.assert_array_equal(matrices(finished), steps)
 
 
 @pytest.mark.parametrize(
@@ -334,38 +278,38 @@ def test_no_step_is_read_where_they_are(finished: list[Spec], reader: Reader, ur
         "UPDATE curve SET attempt = 7, loss = reachable_loss WHERE trial_id IN (1, 4)",
     ],
 )
-def test_steps_are_read_where_they_are_not(
-    finished: list[Spec], reader: Reader, url: str, change: str
-) -> None:
-    before = matrices(reader)
-    execute(url, change)
-    np.testing.assert_array_equal(matrices(reader), before)
-    done = upgrade(url)
-    assert 0 < done.packed <= len(finished)
-    assert upgrade(url).packed == 0
-    execute(url, "DELETE FROM step")
-    np.testing.assert_array_equal(matrices(reader), before)
+def test_steps_are_read_where_no_array_is(finished: Database, change: str) -> None:
+    before = matrices(finished)
+    execute(finished.url, change)
+    np.testing.assert_array_equal(matrices(finished), before)
+    done = upgrade(finished.url)
+    assert 0 < done.packed <= len(SEEDS)
+    assert upgrade(finished.url).packed == 0
+    execute(finished.url, "DELETE FROM step")
+    np.testing.assert_array_equal(matrices(finished), before)
 
 
-@pytest.mark.usefixtures("finished")
-def test_a_damaged_array_is_found_and_not_read(reader: Reader, url: str) -> None:
-    execute(url, "UPDATE curve SET loss = (SELECT states FROM trajectory WHERE trial_id = 1)")
+def errors(url: str) -> list[tuple[int, bool]]:
+    found = [one for one in examine(url) if one.severity == "error"]
+    return [(one.count, "upgrade" in one.advice) for one in found]
+
+
+def test_a_damaged_array_is_found_and_not_read(finished: Database) -> None:
+    damage = "UPDATE curve SET loss = (SELECT states FROM trajectory WHERE trial_id = 1)"
+    execute(finished.url, damage)
     with pytest.raises(StoreUnavailableError, match=r"incomplete \(0 steps instead of 28"):
-        reader.curves(Spec().config_key)
-    (found,) = [one for one in examine(url) if one.severity == "error"]
-    assert (found.count, "upgrade" in found.advice) == (len(SEEDS), True)
-    execute(url, "DELETE FROM curve")
-    upgrade(url)
-    assert [one for one in examine(url) if one.severity == "error"] == []
+        finished.curves()
+    assert errors(finished.url) == [(len(SEEDS), True)]
+    execute(finished.url, "DELETE FROM curve")
+    upgrade(finished.url)
+    assert errors(finished.url) == []
 
 
-@pytest.mark.usefixtures("finished")
-def test_a_trial_that_runs_again_has_its_new_one(store: Store, reader: Reader, take: Take) -> None:
-    assert store.retry("diverged") == 1
-    assert len(reader.rows("SELECT * FROM curve")) == len(SEEDS) - 1
-    (claim,) = take(Spec(2))
-    store.commit(claim, result(2), RUN)
-    found = reader.curves(Spec().config_key)
+def test_a_trial_that_runs_again_has_its_new_array(finished: Database) -> None:
+    assert finished.store.retry("diverged") == 1
+    assert finished.rows("SELECT count(*) FROM curve") == [(len(SEEDS) - 1,)]
+    finished.store.commit(*finished.take(Spec(2)), result(2), RUN)
+    found = finished.curves()
     np.testing.assert_array_equal(found.values[2], result(2).loss)
     assert not found.diverged.any()
 
@@ -376,7 +320,7 @@ class Explored(Spec):
         return '{"env":{"loss":"prequential"}}'
 
 
-def test_that_of_an_exploration_grows_with_it(url: str) -> None:
+def test_the_array_of_an_exploration_grows_with_it(url: str) -> None:
     with Store.open(url) as store:
         launch = store.begin_launch(LAUNCH)
         last = store.save(launch, Explored(), first_steps(3), RUN)
@@ -396,20 +340,21 @@ def first_steps(n: int) -> FakeResult:
     return replace(whole, **cut, states=whole.states[: n + 1], n_steps=n, final_loss=final)
 
 
-def test_a_measure_is_added_to_trials_that_are_done_in_place_of_its_value(
-    store: Store, take: Take, reader: Reader
-) -> None:
-    done, lost, _ = take(*(Spec(seed) for seed in range(3)))
-    store.commit(done, assessed(), RUN)
-    store.commit(lost, diverged(3), RUN)
+def test_a_measure_is_added_to_trials_that_are_done_in_place_of_its_value(db: Database) -> None:
+    done, lost, _ = db.take(*(Spec(seed) for seed in range(3)))
+    db.store.commit(done, assessed(), RUN)
+    db.store.commit(lost, diverged(3), RUN)
     keys = [Spec(seed).trial_key for seed in range(3)]
-    before = reader.assessments(Spec().config_key, "cost").values
+    before = db.reader.assessments(KEY, "cost").values
     for value in (1.5, 0.25):
-        assert store.add_assessments({key: Assessment(7, "added", value) for key in keys}) == 1
-        found = reader.assessments(Spec().config_key, "added")
+        assert db.store.add_assessments({key: Assessment(7, "added", value) for key in keys}) == 1
+        found = db.reader.assessments(KEY, "added")
         assert (found.seeds.tolist(), found.t.tolist()) == ([0], [7])
         assert found.values == value
-    np.testing.assert_array_equal(reader.assessments(Spec().config_key, "cost").values, before)
+    np.testing.assert_array_equal(db.reader.assessments(KEY, "cost").values, before)
+
+
+# Forms of values in a database
 
 
 @given(arrays.arrays(np.float64, arrays.array_shapes(min_dims=1, max_dims=2, min_side=0)))

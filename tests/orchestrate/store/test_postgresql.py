@@ -14,18 +14,20 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import psycopg
 import pytest
-from sqlalchemy import Engine, create_engine, text
+from sqlalchemy import Engine, text
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
-from orchestrate.store.backends import base, postgresql, sqlite_engine
+from orchestrate.store.backends import base, postgresql, sqlite
 from orchestrate.store.backends.base import is_transient
 from orchestrate.store.records import Array
+from tests.orchestrate.store.conftest import Database
 from tests.orchestrate.store.databases import execute, file_of, schema_of
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result, run_all
 from tests.waiting import PATIENCE_SECONDS, until
 
 
@@ -76,61 +78,41 @@ def test_a_heartbeat_or_a_claim_renews_the_lease(
     assert late.commit(claim, result(), RUN)
 
 
-def test_an_ended_connection_costs_one_error(
-    store: Store, launch: int, url: str, take: Callable[..., list[Claim]]
-) -> None:
-    (claim,) = take(Spec())
-    insert_steps = store._backend.insert_steps
+def test_an_ended_connection_costs_one_error(db: Database) -> None:
+    (claim,) = db.take(Spec())
+    backend = db.store._backend
+    insert_steps = backend.insert_steps
 
-    def cut(*arguments: object) -> None:
-        connection = arguments[0]
-        pid = connection.execute(text("SELECT pg_backend_pid()")).scalar_one()  # type: ignore[attr-defined]
-        _end_backend(url, pid)
-        insert_steps(*arguments)  # type: ignore[arg-type]
+    def cut(*arguments: Any) -> None:
+        pid = arguments[0].execute(text("SELECT pg_backend_pid()")).scalar_one()
+        execute(db.url, f"SELECT pg_terminate_backend({pid})")
+        insert_steps(*arguments)
 
-    store._backend.insert_steps = cut  # type: ignore[method-assign]
+    backend.insert_steps = cut  # type: ignore[method-assign]
     with pytest.raises(StoreUnavailableError, match="server runs and answers") as caught:
-        store.commit(claim, result(), RUN)
+        db.store.commit(claim, result(), RUN)
     assert caught.value.transient
-    store._backend.insert_steps = insert_steps  # type: ignore[method-assign]
-    assert store.commit(claim, result(), RUN)
-    store.end_launch(launch, "done")
+    backend.insert_steps = insert_steps  # type: ignore[method-assign]
+    assert db.store.commit(claim, result(), RUN)
 
 
-def _end_backend(url: str, pid: int) -> None:
-    engine = create_engine(url)
-    with engine.begin() as connection:
-        connection.execute(text("SELECT pg_terminate_backend(:pid)"), {"pid": pid})
-    engine.dispose()
-
-
-@pytest.fixture
-def without_encoding(server: Engine) -> Iterator[str]:
-    """Return the URL of a new database as a server without a locale makes it."""
+def test_a_database_without_an_encoding_is_read_and_written(server: Engine) -> None:
+    """As a server without a locale makes it."""
     name = f"test_{uuid.uuid4().hex}"
     engine = server.execution_options(isolation_level="AUTOCOMMIT")
     locale = "ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'"
     with engine.connect() as connection:
         connection.execute(text(f"CREATE DATABASE {name} TEMPLATE template0 {locale}"))
-    yield server.url.set(database=name).render_as_string(hide_password=False)
+    url = server.url.set(database=name).render_as_string(hide_password=False)
+    run_all(url, Spec())
+    with Reader.open(url) as reader:
+        assert [row.status for row in reader.trials(Spec().config_key)] == ["done"]
     with engine.connect() as connection:
         connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
 
 
-def test_a_database_without_an_encoding_is_read_and_written(without_encoding: str) -> None:
-    with Store.open(without_encoding) as store:
-        _, (claim,) = begin(store, Spec())
-        assert store.commit(claim, result(), RUN)
-    with Reader.open(without_encoding) as reader:
-        assert [row.status for row in reader.trials(Spec().config_key)] == ["done"]
-
-
 def test_a_sleeper_that_sends_its_steps_is_ended(
-    url: str,
-    store: Store,
-    open_store: Callable[..., Store],
-    reader: Reader,
-    monkeypatch: pytest.MonkeyPatch,
+    db: Database, open_store: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late = open_store()
     launch, (sent, other) = begin(late, Spec(0), Spec(1))
@@ -146,20 +128,19 @@ def test_a_sleeper_that_sends_its_steps_is_ended(
     with ThreadPoolExecutor(1) as pool:
         committed = pool.submit(late.commit, sent, result(), RUN)
         assert sends.wait(PATIENCE_SECONDS)
-        end_lease(url, launch)
-        freed = store.recover()
+        end_lease(db.url, launch)
+        freed = db.store.recover()
         slept = not committed.done()
         wakes.set()
         with pytest.raises(StoreUnavailableError, match="the connection is lost"):
             committed.result(PATIENCE_SECONDS)
     assert slept, "others waited for the sleeper"
     while freed < 2:  # the server ends its session soon, not at once
-        freed += store.recover()
+        freed += db.store.recover()
     assert freed == 2
     assert not late.commit(sent, result(), RUN)
     assert not late.commit(other, result(1), RUN)
-    rows = reader.rows("SELECT outcome FROM attempt")
-    assert [tuple(row) for row in rows] == [("lost",), ("lost",)]
+    assert db.rows("SELECT outcome FROM attempt") == [("lost",), ("lost",)]
 
 
 def test_a_session_of_a_live_launch_is_left_alone(
@@ -202,23 +183,15 @@ ROW = "SELECT * FROM launch FOR UPDATE"
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Announce a wait after a fraction of the two seconds."""
-    for module in (base, sqlite_engine, postgresql):
+    for module in (base, sqlite, postgresql):
         monkeypatch.setattr(module, "ANNOUNCE_SECONDS", 0.2)
     monkeypatch.setattr(postgresql, "_WATCH_SECONDS", 0.05)
 
 
 @contextmanager
 def session(url: str, name: str = "meddler") -> Iterator[psycopg.Connection]:
-    parsed = make_url(url)
-    with psycopg.connect(
-        host=parsed.host,
-        port=parsed.port,
-        user=parsed.username,
-        password=parsed.password,
-        dbname=parsed.database,
-        application_name=name,
-        options=f"-csearch_path={schema_of(url)}",
-    ) as connection:
+    address = url.replace("+psycopg", "")
+    with psycopg.connect(address, application_name=name) as connection:
         yield connection
 
 
@@ -298,10 +271,13 @@ def test_a_role_that_reads_everything_cannot_take_the_lock(postgresql_url: str) 
     role = f"reader_{schema}"
     Store.open(postgresql_url).close()
     with session(postgresql_url) as owner:
-        owner.execute(f"CREATE ROLE {role}")  # type: ignore[arg-type]
-        owner.execute(f"GRANT USAGE ON SCHEMA {schema} TO {role}")  # type: ignore[arg-type]
-        owner.execute(f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {role}")  # type: ignore[arg-type]
-        owner.execute(f"SET ROLE {role}")  # type: ignore[arg-type]
+        for statement in (
+            f"CREATE ROLE {role}",
+            f"GRANT USAGE ON SCHEMA {schema} TO {role}",
+            f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {role}",
+            f"SET ROLE {role}",
+        ):
+            owner.execute(statement)  # type: ignore[arg-type]
         with pytest.raises(psycopg.errors.InsufficientPrivilege):
             owner.execute(LOCKED)  # type: ignore[arg-type]
         owner.rollback()
@@ -347,39 +323,31 @@ def test_a_creation_that_hangs_is_said_and_ends_the_wait(
     Store.open(sqlite_url).close()
 
 
-@pytest.mark.parametrize("patience", [0.05, 0.5])
-def test_a_free_file_is_locked_at_once(
-    tmp_path: Path, patience: float, caplog: pytest.LogCaptureFixture
-) -> None:
-    taken: list[float] = []
-
-    def locked(seconds: float) -> bool:
-        taken.append(seconds)
-        return True
-
-    sqlite_engine.patiently(locked, patience, tmp_path, tmp_path)
-    assert taken == [min(0.2, patience)]
+def test_a_free_file_is_locked_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for patience in (0.05, 0.5):
+        taken: list[float] = []
+        locked = lambda seconds, taken=taken: not taken.append(seconds)  # noqa: E731
+        sqlite.patiently(locked, patience, tmp_path, tmp_path)
+        assert taken == [min(0.2, patience)]
     assert not warnings(caplog)
-
-
-def _transient(url: str) -> bool:
-    with pytest.raises(StoreUnavailableError) as caught:
-        Store.open(url)
-    return caught.value.transient
 
 
 def test_nobody_listens() -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         port = unused.getsockname()[1]
-        assert _transient(f"postgresql://me@127.0.0.1:{port}/db")
+        with pytest.raises(StoreUnavailableError) as caught:
+            Store.open(f"postgresql://me@127.0.0.1:{port}/db")
+    assert caught.value.transient
 
 
 def test_an_unknown_host_is_a_mistake_unless_it_has_answered_before() -> None:
-    assert not _transient("postgresql://me@no-such-host.invalid/db")
-    with pytest.raises(psycopg.OperationalError) as caught:
+    with pytest.raises(StoreUnavailableError) as caught:
+        Store.open("postgresql://me@no-such-host.invalid/db")
+    assert not caught.value.transient
+    with pytest.raises(psycopg.OperationalError) as failed:
         psycopg.connect("host=no-such-host.invalid")
-    assert is_transient(caught.value, known_host=True)
+    assert is_transient(failed.value, known_host=True)
 
 
 @pytest.mark.parametrize(
@@ -398,37 +366,32 @@ def _write_read_only(store: Store) -> None:
         connection.exec_driver_sql("DELETE FROM trial")
 
 
-def test_a_read_only_server(postgresql_url: str) -> None:
-    with Store.open(postgresql_url) as store:
-        with pytest.raises(StoreUnavailableError, match="server is read-only") as caught:
-            _write_read_only(store)
-        assert not caught.value.transient
+def test_a_read_only_server(store: Store) -> None:
+    with pytest.raises(StoreUnavailableError, match="server is read-only") as caught:
+        _write_read_only(store)
+    assert not caught.value.transient
 
 
-@pytest.mark.parametrize(
-    ("state", "expected"),
-    [("57P01", True), ("57P03", True), ("08006", True), ("40P01", True), ("53300", True),
-     ("53100", False), ("28P01", False), ("58030", False), ("XX001", False), ("57P04", False)],
-)  # fmt: skip
-def test_codes_of_the_server(state: str, expected: bool) -> None:
-    error = psycopg.errors.lookup(state)("the server's words")
-    assert is_transient(error, known_host=False) is expected
+def test_which_errors_of_a_server_end_by_themselves() -> None:
+    codes = {
+        True: ("57P01", "57P03", "08006", "40P01", "53300"),
+        False: ("53100", "28P01", "58030", "XX001", "57P04"),
+    }
+    words = {  # while a connection is made
+        "FATAL:  the database system is starting up": True,
+        "FATAL:  sorry, too many clients already": True,
+        "server closed the connection unexpectedly": True,
+        'FATAL:  password authentication failed for user "me"': False,
+    }
+    for expected, states in codes.items():
+        for state in states:
+            error = psycopg.errors.lookup(state)("the server's words")
+            assert is_transient(error, known_host=False) is expected, state
+    for said, expected in words.items():
+        assert is_transient(psycopg.OperationalError(said), known_host=False) is expected, said
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("FATAL:  the database system is starting up", True),
-        ("FATAL:  sorry, too many clients already", True),
-        ("server closed the connection unexpectedly", True),
-        ('FATAL:  password authentication failed for user "me"', False),
-    ],
-)
-def test_words_of_the_server_while_a_connection_is_made(text: str, expected: bool) -> None:
-    assert is_transient(psycopg.OperationalError(text), known_host=False) is expected
-
-
-@pytest.mark.parametrize("transient", [False, True])
-def test_the_error_travels_between_processes(transient: bool) -> None:
-    error = StoreUnavailableError("The database is gone.", transient=transient)
-    assert pickle.loads(pickle.dumps(error)).transient is transient
+def test_the_error_travels_between_processes() -> None:
+    for transient in (False, True):
+        error = StoreUnavailableError("The database is gone.", transient=transient)
+        assert pickle.loads(pickle.dumps(error)).transient is transient

@@ -5,22 +5,20 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 from orchestrate.runner.saving import IDEMPOTENT, RetryingStore
-from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
+from orchestrate.store import InvalidResultError, Store
 from orchestrate.store import StoreUnavailableError as UnavailableError
 from tests.orchestrate.losses import lose
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.conftest import Database
+from tests.orchestrate.store.fakes import FAILURE, LAUNCH, RUN, Spec, result
 from tests.waiting import PATIENCE_SECONDS
 
-FAILURE = Failure("ZeroDivisionError", "no", "here")
-LOSSES = (["question", "answer"], ["answer", "question", "answer", "answer"])
-SPECS = [Spec(seed) for seed in range(4)]
-
-losses = pytest.mark.parametrize("lost", LOSSES, ids="-".join)
+SPECS = [Spec(seed) for seed in range(6)]
 
 
 @pytest.fixture(autouse=True)
@@ -34,8 +32,8 @@ def said() -> list[str]:
 
 
 @pytest.fixture
-def patient(store: Store, launch: int, said: list[str]) -> RetryingStore:
-    return RetryingStore(store, launch, PATIENCE_SECONDS, said.append)
+def patient(db: Database, said: list[str]) -> RetryingStore:
+    return RetryingStore(db.store, db.launch, PATIENCE_SECONDS, said.append)
 
 
 @pytest.mark.parametrize("name", IDEMPOTENT)
@@ -44,94 +42,49 @@ def test_an_idempotent_operation_takes_the_launch_where_the_table_says_so(name: 
     assert (first == ["launch"]) == IDEMPOTENT[name]
 
 
-@losses
-def test_a_claim(
-    patient: RetryingStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+@pytest.mark.parametrize(
+    "lost", [["question", "answer"], ["answer", "question", "answer", "answer"]], ids="-".join
+)
+def test_each_operation_is_done_once_and_takes_nothing_from_others(
+    patient: RetryingStore, db: Database, monkeypatch: pytest.MonkeyPatch, lost: list[str]
 ) -> None:
-    todo = patient.register(SPECS).todo
-    lose(monkeypatch, lost)
-    claims = patient.claim(todo)
-    assert [claim.trial_key for claim in claims] == todo
-    open_attempts = reader.rows("SELECT trial_id, attempt FROM attempt WHERE outcome IS NULL")
-    assert sorted(map(tuple, open_attempts)) == sorted((c.trial_id, c.attempt) for c in claims)
+    def losing(operation: Callable[..., Any], *arguments: object) -> Any:
+        with monkeypatch.context() as patch:
+            lose(patch, lost)
+            return operation(*arguments)
 
-
-@losses
-def test_a_claim_takes_nothing_from_others(
-    patient: RetryingStore, store: Store, monkeypatch: pytest.MonkeyPatch, lost: list[str]
-) -> None:
     todo = patient.register(SPECS).todo
     [held] = patient.claim(todo[:1])
-    [theirs] = store.claim(store.begin_launch(LAUNCH), todo[1:2])
-    lose(monkeypatch, lost)
-    assert [claim.trial_key for claim in patient.claim(todo[1:])] == todo[2:]
-    assert store.commit(theirs, result(), RUN)
-    assert patient.commit([(held, result(), RUN)]) == [True]
-
-
-@losses
-def test_a_commit(
-    patient: RetryingStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
-) -> None:
-    claims = patient.claim(patient.register(SPECS).todo)
-    lose(monkeypatch, lost)
-    assert patient.commit([(claim, result(claim.trial_id), RUN) for claim in claims]) == [True] * 4
-    curves = reader.curves(SPECS[0].config_key)
-    np.testing.assert_array_equal(curves.values, [result(claim.trial_id).loss for claim in claims])
-
-
-@losses
-def test_a_commit_that_comes_too_late(
-    patient: RetryingStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch,
-    lost: list[str],
-) -> None:  # fmt: skip
-    todo = patient.register(SPECS[:2]).todo
-    claims = patient.claim(todo)
-    store.release(launch, todo[:1])
-    other = store.begin_launch(LAUNCH)
-    [theirs] = store.claim(other, todo[:1])
-    assert store.commit(theirs, result(7), RUN)
-    lose(monkeypatch, lost)
-    assert patient.commit([(claim, result(), RUN) for claim in claims]) == [False, True]
-
-
-@losses
-def test_a_failure(
-    patient: RetryingStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
-) -> None:
-    [claim] = patient.claim(patient.register(SPECS[:1]).todo)
-    lose(monkeypatch, lost)
-    assert patient.fail(claim, FAILURE, RUN)
-    assert len(reader.rows("SELECT * FROM v_failures")) == 1
-
-
-@losses
-def test_final_losses(
-    patient: RetryingStore, monkeypatch: pytest.MonkeyPatch, lost: list[str]
-) -> None:
-    claims = patient.claim(patient.register(SPECS).todo)
-    patient.commit([(claim, result(claim.trial_id), RUN) for claim in claims[:2]])
-    lose(monkeypatch, lost)
-    found = patient.final_losses([spec.trial_key for spec in SPECS])
-    assert found == {one.trial_key: result(one.trial_id).loss[-1] for one in claims[:2]}
+    other = db.store.begin_launch(LAUNCH)
+    [theirs] = db.store.claim(other, todo[1:2])
+    claims = losing(patient.claim, todo[1:])
+    assert [claim.trial_key for claim in claims] == todo[2:]
+    running = db.rows("SELECT trial_id, attempt FROM attempt WHERE outcome IS NULL")
+    expected = [(one.trial_id, one.attempt) for one in (held, theirs, *claims)]
+    assert sorted(running) == sorted(expected)
+    late, failed, *done = claims
+    db.store.release(db.launch, [late.trial_key])
+    [taken] = db.store.claim(other, [late.trial_key])
+    assert db.store.commit(taken, result(7), RUN)
+    assert db.store.commit(theirs, result(1), RUN)
+    sent = [(claim, result(claim.trial_id), RUN) for claim in (late, held, *done)]
+    assert losing(patient.commit, sent) == [False, True, True, True]
+    assert losing(patient.fail, failed, FAILURE, RUN)
+    assert len(db.rows("SELECT * FROM v_failures")) == 1
+    losses = [result(held.trial_id).loss, result(1).loss, result(7).loss]
+    losses += [result(claim.trial_id).loss for claim in done]
+    np.testing.assert_array_equal(db.curves().values, losses)
+    found = losing(patient.final_losses, todo)
+    assert sorted(found.values()) == sorted(loss[-1] for loss in losses)
 
 
 def test_a_failure_that_comes_too_late(
-    patient: RetryingStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch
+    patient: RetryingStore, db: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     [claim] = patient.claim(patient.register(SPECS[:1]).todo)
-    store.release(launch)
+    db.store.release(db.launch)
     lose(monkeypatch, ["question"])
     assert not patient.fail(claim, FAILURE, RUN)
-
-
-def test_a_malformed_result_is_not_waited_for(
-    patient: RetryingStore, take: Callable[..., list[Claim]], said: list[str]
-) -> None:
-    [claim] = take(Spec(0))
-    with pytest.raises(InvalidResultError):
-        patient.commit([(claim, result(horizon=2), RUN)])
-    assert said == []
 
 
 def test_it_says_once_that_it_waits_and_for_how_long(
@@ -144,19 +97,20 @@ def test_it_says_once_that_it_waits_and_for_how_long(
     assert len(said) == 2
 
 
-def test_patience_ends(
-    store: Store, launch: int, said: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_patience_ends(db: Database, monkeypatch: pytest.MonkeyPatch, said: list[str]) -> None:
     lose(monkeypatch, ["question"] * 1000)
     start = time.monotonic()
     with pytest.raises(UnavailableError, match="recover was lost"):
-        RetryingStore(store, launch, 0.5, said.append).recover()
+        RetryingStore(db.store, db.launch, 0.5, said.append).recover()
     assert time.monotonic() - start >= 0.5
 
 
 def test_what_waiting_cannot_help_is_raised_at_once(
-    patient: RetryingStore, said: list[str], monkeypatch: pytest.MonkeyPatch
+    patient: RetryingStore, db: Database, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    [claim] = db.take(Spec(0))
+    with pytest.raises(InvalidResultError):
+        patient.commit([(claim, result(horizon=2), RUN)])
     lose(monkeypatch, ["question", "", ""], transient=False)
     with pytest.raises(UnavailableError, match="recover was lost"):
         patient.recover()

@@ -23,10 +23,9 @@ from orchestrate.store import (
     Store,
     StoreError,
     StoreUnavailableError,
-    launches,
 )
-from orchestrate.store.backends import sqlite_engine
-from orchestrate.store.backends.sqlite_engine import _is_read_only, read_address
+from orchestrate.store.backends import sqlite
+from orchestrate.store.backends.sqlite import _is_read_only, read_address
 from orchestrate.store.maintenance import examine
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
 from tests.orchestrate.store.processes import (
@@ -154,13 +153,13 @@ def test_a_forked_worker_does_not_keep_the_launch_alive(store: Store, url: str) 
 def test_a_launch_that_could_not_begin_leaves_no_lock(
     store: Store, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin = launches.begin
+    hold = store._backend.hold
 
-    def fail(*given: Any) -> int:
-        begin(*given)
+    def fail(*given: Any) -> None:
+        hold(*given)
         raise OSError(28, "no space left")
 
-    monkeypatch.setattr(launches, "begin", fail)
+    monkeypatch.setattr(store._backend, "hold", fail)
     descriptors = len(list(Path("/proc/self/fd").iterdir()))
     with pytest.raises(OSError, match="no space left"):
         store.begin_launch(LAUNCH)
@@ -509,7 +508,7 @@ def test_a_long_reader_holds_up_nobody_and_the_log_shrinks_afterwards(
     url: str, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limit = 2**18
-    monkeypatch.setattr(sqlite_engine, "MAX_LOG_BYTES", limit)
+    monkeypatch.setattr(sqlite, "MAX_LOG_BYTES", limit)
     wal = path.with_name("results.db-wal")
     specs = [Spec(seed, horizon=300) for seed in range(120)]
     with Store.open(url) as store, Reader.open(url) as reader:

@@ -20,7 +20,7 @@ from orchestrate.store import (
     StoreUnavailableError,
 )
 from orchestrate.store import maintenance as migration
-from orchestrate.store.backends.sqlite_engine import LaunchLocks
+from orchestrate.store.backends.sqlite import LaunchLocks
 from orchestrate.store.maintenance import upgrade
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
 from tests.orchestrate.store.conftest import each_version
