@@ -224,7 +224,9 @@ class Samples(NamedTuple):
         """Return a copy, whose factors are to begin where those in force do not."""
         network, theta, posterior = self
         n_samples = network.process.n_samples.copy()
-        other = Posterior(posterior.factors, *(part.copy() for part in posterior[1:]))
+        parts = posterior._asdict().items()
+        copies = {name: part.copy() for name, part in parts if name != "factors"}
+        other = posterior._replace(**copies)
         other.first[0] = len(posterior.factors) // 2 - posterior.first[0]
         process = network.process._replace(n_samples=n_samples)
         return Samples(network._replace(process=process), theta.copy(), other)

@@ -146,7 +146,7 @@ MEASUREMENTS: dict[str, Callable[[], Iterator[Row]]] = {
     "N": functools.partial(points, 1, 2, 4, 8, 16, 32),
     "chain": functools.partial(tenths, "chain", 64, 100_000, "sketch", "adam_window"),
     "exact": functools.partial(tenths, "cartpole", 64, 2_000, "primal", "adam_window"),
-    "wide": functools.partial(tenths, "cartpole", 1024, 20_000, "sketch", "adam"),
+    "wide": functools.partial(tenths, "cartpole", 1024, 100_000, "sketch", "adam"),
     "drone": functools.partial(tenths, "drone", 64, 100_000, "sketch", "adam_window"),
 }
 

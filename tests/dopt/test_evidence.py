@@ -156,7 +156,7 @@ def test_what_adds_little_is_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     one = trial_in_kernel(spec)
     one.advance(300)
     posterior, n = one.trial.state.posterior, int(one.trial.network.process.n_samples[0])
-    assert posterior.factors.shape == (1, 60, 60)
+    assert posterior.factors.shape == (2, 60, 60)  # the second for a refit beside
     assert n <= 60
     assert posterior.counts[:n].sum() == 300
     assert one.record.loss[299] == pytest.approx(grid_loss(spec, one.parameters), rel=1e-9)
