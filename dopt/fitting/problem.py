@@ -44,7 +44,7 @@ FIRST_DAMPING = 1.0
 LEAST_DAMPING = 1e-6
 
 LARGEST_DAMPING = 1e12
-"""Damping at which no step is short enough: a minimum up to rounding if little is foreseen."""
+"""Damping, by the mean precision of a parameter, at which no step is short enough."""
 
 STUCK = 1e12
 """What a window that leaves the limit counts for, by c."""
@@ -69,7 +69,7 @@ class Windows(NamedTuple):
     rows: Integers  # (k, 2)
     starts: Array  # (k, d)
 
-    def where(self, wanted: Booleans) -> Windows:
+    def where(self, wanted: Booleans | Integers) -> Windows:
         """Return some of the windows."""
         return Windows(
             np.ascontiguousarray(self.rows[wanted]), np.ascontiguousarray(self.starts[wanted])
@@ -284,20 +284,21 @@ def solve(
         linear = simulator.linear(p, windows, weights / s**2)
         H, b = linear.normal + np.diag(precision), linear.slope - precision * (p - model.prior)
         growth, new = 2.0, math.inf
-        while damping < LARGEST_DAMPING:
+        size = max(np.trace(H) / max(model.q, 1), 1.0)
+        while damping < LARGEST_DAMPING * size:
             factor = cho_factor(H + damping * np.eye(model.q), check_finite=False)
             step = cho_solve(factor, b, check_finite=False)
             trial = p + step
             moved = windows._replace(starts=_moved(windows.starts, linear, step))
-            after, held = simulator.squares(trial, moved), np.zeros(1, bool)
+            after, held = simulator.squares(trial, moved), np.empty(0, int)
             if not cost(after, trial) < value:
-                size = max(np.trace(H) / max(model.q, 1), 1.0)
                 share = size / (size + damping)  # about as p is damped
-                damped = _moved(windows.starts, linear, step, share)
-                others = simulator.squares(trial, windows._replace(starts=damped))
-                held = (after > squares) & (others < after)
-                moved = windows._replace(starts=np.where(held[:, None], damped, moved.starts))
-                after = np.where(held, others, after)
+                damped = windows._replace(starts=_moved(windows.starts, linear, step, share))
+                worse = np.flatnonzero(after > squares)
+                others = simulator.squares(trial, damped.where(worse))
+                held = worse[others < after[worse]]
+                moved.starts[held] = damped.starts[held]
+                after[held] = others[others < after[worse]]
             new = cost(after, trial)
             if new < value:
                 break
@@ -309,11 +310,13 @@ def solve(
             break
         fall, foreseen = value - new, float(step @ (b + damping * step))
         ratio = fall / foreseen if foreseen > 0.0 else 1.0
-        damping = max(damping * max(1.0 / 9.0, 1.0 - (2.0 * ratio - 1.0) ** 3), LEAST_DAMPING)
+        damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), LEAST_DAMPING)
         p, windows, squares = trial, moved, after
         if say:
             say(f"  step {steps}: cost {new:.6g}, fall {fall / value:.1e}, damping {damping:.0e}")
-        calm = calm + 1 if fall < tolerance * value and not held.any() else 0
+        left = b @ np.linalg.solve(H, b)
+        small = fall < tolerance * value and left < 10.0 * tolerance * value
+        calm = calm + 1 if small and not len(held) else 0
         value, converged = new, calm >= 2
     return Solution(p, windows, squares, scale, steps, converged)
 
