@@ -16,6 +16,7 @@ Predictions of parts of a log are at the end, with a linear model for comparison
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ from scipy.linalg import blas, cho_factor, cho_solve
 from dopt.fitting import simulation
 from dopt.fitting.model import Model
 from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values
+from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
 from dopt.types import Array, Booleans, Integers
@@ -110,23 +112,12 @@ class Simulator:
         return self._filtered
 
     def squares(self, p: Array, windows: Windows) -> Array:
-        values = self.model.values(p)
-        out = np.empty(len(windows.rows))
-        call(
-            *(simulation.write_squares, self.model.structure, values, self.data),
-            *(windows.rows, windows.starts, *self.filtered(values), self.tolerance),
-            *(self._dull, np.empty((windows.longest, self.model.d)), self._nothing, out),
-        )
-        return out
+        return self._simulate(p, windows, np.empty((windows.longest, self.model.d)))
 
     def states(self, p: Array, first: int, last: int, start: Array) -> Array:
         """Return simulated states, (rows, d), NaN from where they leave the limit."""
-        values = self.model.values(p)
         out = np.full((last - first + 1, self.model.d), np.nan)
-        call(
-            *(simulation.run, self.model.structure, values, self.data, first, last, start),
-            *(*self.filtered(values), self.tolerance, self._dull, False, out, self._nothing),
-        )
+        self._simulate(p, Windows(np.array([[first, last]]), start[None]), out)
         return out
 
     def residuals(self, p: Array, windows: Windows) -> Array:
@@ -139,14 +130,24 @@ class Simulator:
 
     def slopes(self, p: Array, first: int, last: int, start: Array) -> tuple[Array, Array]:
         """Return simulated states, (rows, d), and S, (rows, d, q + d)."""
-        values, rows = self.model.values(p), last - first + 1
-        states = np.full((rows, self.model.d), np.nan)
-        S = np.full((rows, self.model.d, self.model.q + self.model.d), np.nan)
-        call(
-            *(simulation.run, self.model.structure, values, self.data, first, last, start),
-            *(*self.filtered(values), self.tolerance, self._sharp, True, states, S),
-        )
+        rows, d = last - first + 1, self.model.d
+        states, S = np.full((rows, d), np.nan), np.full((rows, d, self.model.q + d), np.nan)
+        self._simulate(p, Windows(np.array([[first, last]]), start[None]), states, S)
         return states, S
+
+    def _simulate(
+        self, p: Array, windows: Windows, states: Array, slopes: Array | None = None
+    ) -> Array:
+        """Return ‖e‖² of windows; write the states, and S where wanted, of the last one."""
+        values, d, squares = self.model.values(p), self.model.d, np.empty(len(windows.rows))
+        work, S = (self._dull, self._nothing) if slopes is None else (self._sharp, slopes)
+        call(
+            *(simulation.simulate, self.model.structure, values, self.data, *windows, squares),
+            *(*self.filtered(values), self.tolerance, work, slopes is not None, states, S),
+            *(np.empty(shape) for shape in ((0, d), (0, 0), 0, (0, d, d), (0, d, 0), (0, d))),
+            squares,
+        )
+        return squares
 
     def settled(self, p: Array, windows: Windows, steps: int = 8) -> Windows:
         """Return the windows with the initial states that fit them best at p."""
@@ -199,8 +200,8 @@ class Simulator:
             R, e = np.empty((n, q)), np.empty(n)
             part = slice(first, last)
             call(
-                *(simulation.write_rows, model.structure, values, data, windows.rows[part]),
-                *(windows.starts[part], roots[part], v, dv, self.tolerance, work),
+                *(simulation.simulate, model.structure, values, data, windows.rows[part]),
+                *(windows.starts[part], roots[part], v, dv, self.tolerance, work, True),
                 *(states, slopes, Q, R, e, T[part], C[part], g[part], squares[part]),
             )
             if q:
@@ -339,7 +340,10 @@ def call(function: Any, *arguments: Any) -> Any:
         return function(*arguments)
     key = function, *map(_key, arguments)
     if key not in _codes:
-        _codes[key] = function.compile(tuple(map(_kind, arguments)))
+        kinds = tuple(map(_kind, arguments))
+        digest = hashlib.sha256(f"{simulation.DIGEST}{kinds}".encode()).hexdigest()[:16]
+        with one_compiler_at_a_time(f"{function.__module__}.{function.__name__}-{digest}"):
+            _codes[key] = function.compile(kinds)
     return _codes[key](*arguments)
 
 

@@ -45,7 +45,8 @@ from dopt.types import CompiledFunction, Integers, Matrix, Vector
 
 DERIVATIVES = types.void(*[types.float64[::1]] * 4, types.float64[:, ::1])
 
-_DIGEST = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
+DIGEST = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
+"""Of this file, on which the machine code depends."""
 
 
 def _inlined(function: CompiledFunction) -> CompiledFunction:
@@ -64,7 +65,7 @@ def _compiled(function: CompiledFunction) -> CompiledFunction:
         return function
     options = {"error_model": "numpy", "fastmath": False, "nogil": True}
     dispatcher = numba.njit(_nrt=False, **options)(function)
-    dispatcher._cache = StoredCode(function, f"fitting-{_DIGEST}")
+    dispatcher._cache = StoredCode(function, f"fitting-{DIGEST}")
     return dispatcher
 
 
@@ -563,7 +564,20 @@ def write_window(
 
 
 @_compiled
-def write_rows(
+def _squares(structure: Structure, data: Data, first: int, rows: int, states: Matrix) -> float:
+    """Return ‖e‖² of a window."""
+    total = 0.0
+    for k in range(rows):
+        for c in range(structure.measured.shape[0]):
+            seen = data.measured[first + k, c]
+            if not math.isnan(seen):
+                error = (seen - states[k, structure.measured[c]]) / data.deviations[c]
+                total += error * error
+    return total
+
+
+@_compiled
+def simulate(
     structure: Structure,
     values: Values,
     data: Data,
@@ -574,6 +588,7 @@ def write_rows(
     dfiltered: types.Array,
     tolerance: float,
     work: Work,
+    sensitive: bool,
     states: Matrix,
     slopes: types.Array,
     Q: Matrix,
@@ -584,34 +599,39 @@ def write_rows(
     g: Matrix,
     squares: Vector,
 ) -> None:
-    """Write the rows of windows, (k, 2) first and last rows, one below the other.
+    """Simulate windows, (k, 2) first and last rows, from their initial states, (k, d).
 
-    ``squares`` are ‖e‖² of the windows with their initial states, (k, d), as they are; inf where a
-    window leaves the limit, whose rows are 0. ``states``, ``slopes`` and Q, (rows n, d), are room
-    for the longest window.
+    ``squares`` are ‖e‖² of the windows, inf where one leaves the limit. ``states`` and ``slopes``
+    are those of the last window, and room for the longest. Where R has rows, those of the windows
+    are written one below the other, 0 where one leaves the limit; Q, (rows n, d), is room.
+
+    All that simulates is compiled in this one function.
     """
     d, n = work.S.shape
     q, channels = n - d, structure.measured.shape[0]
     at = 0
     for k in range(windows.shape[0]):
-        first, rows = windows[k, 0], windows[k, 1] - windows[k, 0] + 1
+        first, last = windows[k, 0], windows[k, 1]
+        rows = last - first + 1
         here = slice(at, at + rows * channels)
         inside = run(
             structure,
             values,
             data,
             first,
-            windows[k, 1],
+            last,
             starts[k],
             filtered,
             dfiltered,
             tolerance,
             work,
-            True,
+            sensitive,
             states,
             slopes,
         )
-        if inside:
+        if R.shape[0] == 0:
+            squares[k] = _squares(structure, data, first, rows, states) if inside else np.inf
+        elif inside:
             squares[k] = write_window(
                 structure,
                 data,
@@ -636,48 +656,3 @@ def write_rows(
             C[k] = 0.0
             g[k] = 0.0
         at += rows * channels
-
-
-@_compiled
-def write_squares(
-    structure: Structure,
-    values: Values,
-    data: Data,
-    windows: types.Array,
-    starts: Matrix,
-    filtered: Matrix,
-    dfiltered: types.Array,
-    tolerance: float,
-    work: Work,
-    states: Matrix,
-    nothing: types.Array,
-    squares: Vector,
-) -> None:
-    """Write ‖e‖² of windows, without sensitivities; inf where one leaves the limit."""
-    channels = structure.measured.shape[0]
-    for k in range(windows.shape[0]):
-        first, last = windows[k, 0], windows[k, 1]
-        inside = run(
-            structure,
-            values,
-            data,
-            first,
-            last,
-            starts[k],
-            filtered,
-            dfiltered,
-            tolerance,
-            work,
-            False,
-            states,
-            nothing,
-        )
-        squares[k] = 0.0 if inside else np.inf
-        if not inside:
-            continue
-        for row in range(last - first + 1):
-            for c in range(channels):
-                seen = data.measured[first + row, c]
-                if not math.isnan(seen):
-                    error = (seen - states[row, structure.measured[c]]) / data.deviations[c]
-                    squares[k] += error * error
