@@ -1,6 +1,6 @@
 """Designs for many unknowns: expected errors by multisines, and errors of fits after them.
 
-``python -m studies.robots.designs --urdf MODEL --limits FILE --seeds 20`` appends a row for each
+``python -m studies.robots.designs --urdf MODEL --seeds 20`` appends a row for each
 arm and seed to ``docs/robots_designs.csv``. The seed draws the multisines, the search, and a robot
 whose parameters differ from the file's by 10 % of each one's size; torques are measured with white
 noise.
@@ -23,7 +23,7 @@ from dopt.robots.limits import Limits
 from dopt.robots.parameters import SLOW, Identifiability, relative_errors
 from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
 from dopt.types import Array
-from studies.robots.simulated import CONTROL, Friction, SimulatedRobot, iiwa, jaco
+from studies.robots.simulated import CONTROL, LIMITS, Friction, SimulatedRobot, iiwa, jaco
 
 FILE = Path("docs/robots_designs.csv")
 
@@ -172,7 +172,7 @@ def main() -> None:
     """Append the rows that are missing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--urdf", type=Path, help="URDF of the iiwa")
-    parser.add_argument("--limits", type=Path, help="its limits")
+    parser.add_argument("--limits", type=Path, default=LIMITS, help="its limits")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--effort", type=int, default=600)
     given = parser.parse_args()

@@ -1,6 +1,6 @@
 """Friction learned online: time to 5 %, coverage at the stop, limits, payloads and step times.
 
-``python -m studies.robots.online PART --urdf MODEL --limits FILE --seeds 20`` appends rows to
+``python -m studies.robots.online PART --urdf MODEL --seeds 20`` appends rows to
 ``docs/robots_online.csv``; PART is times, coverage, payload or steps. A robot of the study has
 friction, noise and ripple from its seed.
 """
@@ -29,7 +29,7 @@ from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
 from dopt.robots.trajectories import Family, Fourier, Ladder, Multisine
 from dopt.robots.windows import window_size
 from dopt.types import Array
-from studies.robots.simulated import CONTROL, SimulatedRobot, iiwa, jaco
+from studies.robots.simulated import CONTROL, LIMITS, SimulatedRobot, iiwa, jaco
 
 FILE = Path("docs/robots_online.csv")
 
@@ -323,14 +323,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--urdf", type=Path, help="model of the iiwa; without it, the other arm")
-    parser.add_argument("--limits", type=Path, help="limits of the iiwa")
+    parser.add_argument("--limits", type=Path, default=LIMITS, help="limits of the iiwa")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--arm", choices=("iiwa", "jaco"), help="one arm alone")
     parser.add_argument("--out", type=Path, default=FILE)
     given = parser.parse_args()
     arms = {"jaco": jaco()}
-    if given.urdf and given.limits:
+    if given.urdf:
         arms["iiwa"] = iiwa(given.urdf, given.limits)
     fresh = not given.out.exists()
     with given.out.open("a", newline="") as file:

@@ -196,6 +196,9 @@ class SimulatedRobot:
         return self.friction.torques(every)[:, joint]
 
 
+LIMITS = Path(__file__).with_name("iiwa.yaml")
+
+
 def iiwa(urdf: Path, limits: Path) -> tuple[Body, Limits]:
     """Return KUKA's iiwa 7, by the URDF of pybullet with rotors, and a file of its true limits."""
     body = Body.load(urdf)
@@ -225,4 +228,4 @@ def jaco() -> tuple[Body, Limits]:
     )
 
 
-__all__ = ["CONTROL", "Friction", "SimulatedRobot", "iiwa", "jaco"]
+__all__ = ["CONTROL", "LIMITS", "Friction", "SimulatedRobot", "iiwa", "jaco"]
