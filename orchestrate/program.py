@@ -59,6 +59,8 @@ SUCCESSORS = {
     "export bundle": "copy trials into a file with python -m orchestrate merge OTHER --db "
     "sqlite:///FILE, or export trials, curves, trajectories and assessments as Parquet",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
+    "executor=slurm": "register the grid with launch.detach=true, and submit its workers with "
+    "sbatch docs/example/slurm_workers.sh",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
     "experiment=flex_table1_agents": "studies/agents/README.md has it as experiment=agents",

@@ -55,7 +55,7 @@ _OPTIONS = (
 )
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
-_PATHS = ("store.url", "store.folder", "executor.logs")
+_PATHS = ("store.url", "store.folder")
 _UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
 """Path with a character that Hydra takes in quotes alone."""
 

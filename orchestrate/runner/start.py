@@ -28,7 +28,7 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.executors.base import Executor, Job, Run, executor_factory, make_executor, make_job
+from orchestrate.executors.base import Executor, Run, executor_factory, make_executor
 from orchestrate.program import ROOT, answered, exit_code, say, tell
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
 from orchestrate.runner.saving import Heartbeat, RetryingStore, launch_record
@@ -36,7 +36,6 @@ from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memo
 from orchestrate.store import (
     FINISHED,
     RETRIED,
-    URL_VARIABLE,
     DatabaseMovedError,
     LaunchRecord,
     NoDatabaseError,
@@ -126,11 +125,10 @@ def launch_grid(
     output = Output(say, warn or say, stream)
     if not settings.detach:
         executor_factory(settings).check(settings)
-    job = make_job(settings)
 
     def body(store: RetryingStore) -> ExitCode:
-        if settings.detach or job is not None:
-            return leave(store, grid, settings, job, say)
+        if settings.detach:
+            return leave(store, grid, settings, say)
         return _run(store, grid, settings, work, output)
 
     return recorded_launch(settings, record, output, body)
@@ -309,22 +307,12 @@ def _count(tally: Tally, state: Registration) -> None:
 WORKER = "python -m orchestrate work"
 
 
-def leave(
-    store: RetryingStore,
-    grid: Grid,
-    settings: LaunchSettings,
-    job: Job | None,
-    say: Say,
-) -> ExitCode:
-    """Register the grid for workers, and submit the job in which they run."""
+def leave(store: RetryingStore, grid: Grid, settings: LaunchSettings, say: Say) -> ExitCode:
+    """Register the grid for workers."""
     free_trials(store, grid, settings)
     state = store.register(grid.trials)
-    if job is None:
-        say(f"{registered(grid, state)}; start workers with {WORKER} --db {store.safe_url}")
-        return ExitCode.DONE
-    say(f"{registered(grid, state)} · {store.safe_url}")
-    if state.todo:
-        say(job.submit(len(state.todo), {URL_VARIABLE: settings.store_url}))
+    counts = f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
+    say(f"{counts}; start workers with {WORKER} --db {store.safe_url}")
     return ExitCode.DONE
 
 
@@ -391,11 +379,6 @@ def _stop(thread: threading.Thread, ended: threading.Event) -> None:
 
 MAX_LISTED_CAUSES = 3
 """Causes of failure that the summary lists."""
-
-
-def registered(grid: Grid, state: Registration) -> str:
-    """Return the counts of a grid that was registered for workers."""
-    return f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
 
 
 def _counts(grid: Grid, state: Registration, running: str, heading: str = "") -> str:
@@ -478,29 +461,22 @@ def _check_kind(settings: LaunchSettings, *, single: bool) -> None:
             "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
             "-m and a range such as 'seed=range(100)', or leave launch.until out."
         )
-    leaving = _leaving(settings)
+    leaving = settings.detach
     if single and (leaving or settings.share):
-        key = leaving or "launch.share"
+        key = "launch.detach" if leaving else "launch.share"
         raise LaunchError(
             f"{key} is for grids, but a single trial is asked for: add -m, or leave {key} out."
         )
     if settings.share and (leaving or settings.until):
         raise LaunchError(
-            f"{leaving or 'launch.until'} needs the whole grid in one database, but launch.share "
-            "takes a part of it: leave one of the two out."
+            f"launch.{'detach' if leaving else 'until'} needs the whole grid in one database, but "
+            "launch.share takes a part of it: leave one of the two out."
         )
     if leaving and settings.until:
         raise LaunchError(
-            f"launch.until looks at results before it asks for more seeds, but {leaving} leaves "
+            "launch.until looks at results before it asks for more seeds, but launch.detach leaves "
             "before there are any: leave one of the two out."
         )
-
-
-def _leaving(settings: LaunchSettings) -> str:
-    """Return the setting by which a launch leaves its grid to workers; empty without one."""
-    if settings.detach:
-        return "launch.detach"
-    return f"executor={settings.executor}" if make_job(settings) else ""
 
 
 @answered
@@ -512,8 +488,6 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
         say(preview(grid, settings.store_url, settings.retry))
         if settings.until:
             say("launch.until may need fewer of these seeds: they are run in batches")
-        if job := make_job(settings):
-            say(job.text(len(grid.trials)))
         return ExitCode.DONE
     record = launch_record(sys.argv, request.overrides, ROOT)
     if not request.single:

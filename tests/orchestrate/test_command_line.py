@@ -444,7 +444,9 @@ def test_a_grid_goes_on_when_its_output_is_closed(
         assert [tuple(row) for row in rows] == [(2,)]
 
 
-@pytest.mark.parametrize("word", [name for name in SUCCESSORS if name.startswith("launch.")])
+@pytest.mark.parametrize(
+    "word", [name for name in SUCCESSORS if name.startswith(("launch.", "executor="))]
+)
 def test_settings_of_a_launch(command_line: Callable[..., tuple[int, str, str]], word: str) -> None:
     code, output, errors = command_line("-m", word if "=" in word else f"{word}=1")
     assert (code, output) == (2, "")

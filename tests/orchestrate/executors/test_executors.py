@@ -338,7 +338,7 @@ def test_each_executor_has_a_configuration_file() -> None:
     assert files == set(EXECUTORS)
 
 
-@pytest.mark.parametrize("name", ["local", "lockstep", "ray", "slurm"])
+@pytest.mark.parametrize("name", ["local", "lockstep", "ray"])
 def test_an_executor_is_named_in_its_own_files_and_the_registry_only(name: str) -> None:
     module = f"orchestrate.executors.{name}"
     own = {f"orchestrate/executors/{name}.py", "orchestrate/executors/base.py"}
