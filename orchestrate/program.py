@@ -61,6 +61,8 @@ SUCCESSORS = {
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
     "executor=slurm": "register the grid with launch.detach=true, and submit its workers with "
     "sbatch docs/example/slurm_workers.sh",
+    "store=shards": "docs/example/share.sh runs a share of the seeds and copies its database",
+    "launch.share": "docs/example/share.sh runs a share of the seeds and copies its database",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
     "experiment=flex_table1_agents": "studies/agents/README.md has it as experiment=agents",

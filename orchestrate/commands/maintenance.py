@@ -21,7 +21,7 @@ from orchestrate.store.maintenance import (
     Upgrade,
     back_up,
     examine,
-    merge_collected,
+    merge_folder,
     prunable,
     upgrade,
 )
@@ -36,7 +36,7 @@ def _add_merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "other",
         metavar="OTHER",
-        help="file or URL of the other database, or folder of shards",
+        help="file or URL of the other database, or folder of SQLite files",
     )
 
 
@@ -56,7 +56,7 @@ def _merge(url: str, other: str) -> Merged:
     if not place.is_dir():
         return merge(url, f"sqlite:///{place.absolute()}", trial_key)
     total = Merged()
-    for merged in merge_collected(url, place, trial_key=trial_key):
+    for merged in merge_folder(url, place, trial_key):
         total.include(merged)
     return total
 

@@ -6,7 +6,7 @@ This module holds the grid, built from the combinations of a command line.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dopt.errors import IncompatibleError, SpecificationError
@@ -69,12 +69,6 @@ class Grid:
     def repeats(self) -> int:
         """Number of jobs that repeat a trial."""
         return self.n_jobs - sum(self.left_out.values()) - len(self.trials)
-
-    def only(self, wanted: Callable[[str], bool]) -> Grid:
-        """Return the grid with the trials whose keys are wanted."""
-        trials = [trial for trial in self.trials if wanted(trial.trial_key)]
-        n_jobs = self.n_jobs - len(self.trials) + len(trials)
-        return dataclasses.replace(self, trials=trials, n_jobs=n_jobs)
 
     def on_path(self, path: str) -> Grid:
         """Return the grid with its trials on an execution path."""

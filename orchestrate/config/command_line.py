@@ -55,7 +55,6 @@ _OPTIONS = (
 )
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
-_PATHS = ("store.url", "store.folder")
 _UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
 """Path with a character that Hydra takes in quotes alone."""
 
@@ -196,7 +195,7 @@ def _quoted(word: str) -> str:
     """Return ``launch.until=ci<5%`` or a path with the quotes that Hydra requires around them."""
     key, _, value = word.partition("=")
     rule = key.lstrip("+") == "launch.until" and value.startswith("ci")
-    if rule or (key.lstrip("+") in _PATHS and _UNQUOTED.fullmatch(value)):
+    if rule or (key.lstrip("+") == "store.url" and _UNQUOTED.fullmatch(value)):
         return f"{key}='{value}'"
     return word
 

@@ -6,13 +6,11 @@ A refusal names the key, the value and the range.
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal, cast
 
-from dopt.errors import given_path, stripped, unknown_name
+from dopt.errors import stripped, unknown_name
 from orchestrate.errors import LaunchError
 
 LARGEST = 1_000_000_000
@@ -95,46 +93,6 @@ def precision(key: str, value: object) -> float | None:
     )
 
 
-_SHARE = re.compile(r"(\d+)/(\d+)")
-
-
-@dataclass(frozen=True)
-class Share:
-    """Share ``number``, from 1 on, of ``count`` shares of a grid.
-
-    Each trial belongs to one share, whatever else the grid holds.
-    """
-
-    number: int
-    count: int
-
-    def __str__(self) -> str:
-        return f"{self.number}-of-{self.count}"
-
-    def holds(self, trial_key: str) -> bool:
-        """Return whether a trial belongs to the share; its key is a hash."""
-        return int(trial_key[:12], 16) % self.count == self.number - 1
-
-
-def share(value: object) -> Share | None:
-    """Return the share that a setting such as ``3/20`` names, or None for the whole grid.
-
-    Raises
-    ------
-    LaunchError
-        If the setting names no share.
-    """
-    if value is None:
-        return None
-    found = _SHARE.fullmatch(value) if isinstance(value, str) else None
-    if found is None or not 1 <= int(found[1]) <= int(found[2]):
-        raise wrong("launch.share", value, "null or a share I/N with I from 1 to N, such as 3/20,")
-    return Share(int(found[1]), int(found[2]))
-
-
-SHARD_SUFFIX = ".db"
-"""End of the name of a file that holds a share."""
-
 RETRY = ("failed", "diverged", "all")
 
 Retry = Literal["failed", "diverged", "all"]
@@ -152,10 +110,6 @@ class LaunchSettings:
         SQLAlchemy URL of the results database.
     detach
         Register the grid and leave; workers run it.
-    share
-        Part of the grid that this launch runs, or None for the whole grid.
-    collect_in, collect_seconds
-        Folder to which a SQLite database is copied, or None for no copies; time between two copies.
     retry
         Finished trials of the grid that are run again.
     until
@@ -186,9 +140,6 @@ class LaunchSettings:
     dry_run: bool = False
     detach: bool = False
     fail_fast: bool = False
-    share: Share | None = None
-    collect_in: Path | None = None
-    collect_seconds: float = 60.0
     retry: Retry | None = None
     until: float | None = None
     workers: int | None = None
@@ -211,19 +162,17 @@ class LaunchSettings:
             If a value has the wrong type or is out of bounds.
         """
         launch = section("launch", given["launch"])
-        executor = section("executor", given["executor"])
-        part = share(launch["share"])
+        store, executor = section("store", given["store"]), section("executor", given["executor"])
         memory_gib = limit("launch.memory_gib", launch["memory_gib"], "GiB")
         retry = launch["retry"]
         if retry is not None and retry not in RETRY:
             raise unknown_name("launch.retry", retry, RETRY)
         return cls(
             executor=text("executor.name", executor["name"]),
-            **_place(section("store", given["store"]), part),
+            store_url=stripped(text("store.url", store["url"]), "store.url", LaunchError),
             dry_run=flag("launch.dry_run", launch["dry_run"]),
             detach=flag("launch.detach", launch["detach"]),
             fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
-            share=part,
             retry=cast("Retry | None", retry),
             until=precision("launch.until", launch["until"]),
             workers=count("launch.workers", launch["workers"]),
@@ -237,21 +186,6 @@ class LaunchSettings:
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},
         )
-
-
-def _place(store: Mapping[str, Any], part: Share | None) -> dict[str, Any]:
-    """Return where results go; a store with a folder for copies holds one share of a grid."""
-    url = stripped(text("store.url", store["url"]), "store.url", LaunchError)
-    if store.get("folder") is None:
-        return {"store_url": url}
-    if part is None:
-        raise wrong("launch.share", None, "with store=shards a share such as 3/20")
-    if not url.startswith("sqlite") or not url.endswith(SHARD_SUFFIX):
-        raise wrong("store.url", url, "with store=shards a file such as sqlite:////var/tmp/x.db")
-    file = f"{url.removesuffix(SHARD_SUFFIX)}.{part}.{socket.gethostname()}{SHARD_SUFFIX}"
-    folder = given_path(text("store.folder", store["folder"]), "store.folder", LaunchError)
-    every = amount("store.every", store["every"], "seconds")
-    return {"store_url": file, "collect_in": folder, "collect_seconds": every}
 
 
 def _lease_and_patience(lease: object, patience: object) -> dict[str, Any]:

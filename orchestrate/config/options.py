@@ -496,7 +496,7 @@ def check_launch(launch: Mapping[str, object]) -> None:
     executor = launch["executor"]
     name = executor.get("name") if isinstance(executor, Mapping) else None
     _check("launch", launch["launch"], content_of(CONFIGURATION / "config.yaml").get("launch"))
-    _check("store", launch["store"], dict.fromkeys(("url", "folder", "every")))
+    _check("store", launch["store"], {"url": None})
     _check("executor", executor, content_of(CONFIGURATION / "executor" / f"{name}.yaml"))
 
 

@@ -1,7 +1,7 @@
 """Start of a launch: its checks, and its grid, its single trial or its preview.
 
-A grid is registered and runs in stages; a share of one is copied on the way. A single trial runs in
-this process, and ``launch.dry_run=true`` shows the preview.
+A grid is registered and runs in stages. A single trial runs in this process, and
+``launch.dry_run=true`` shows the preview.
 """
 
 from __future__ import annotations
@@ -36,18 +36,15 @@ from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memo
 from orchestrate.store import (
     FINISHED,
     RETRIED,
-    DatabaseMovedError,
     LaunchRecord,
     NoDatabaseError,
     Reader,
     Registration,
     SchemaVersionError,
     Store,
-    StoreError,
     StoreUnavailableError,
     TrialRow,
 )
-from orchestrate.store.maintenance import collect, merge_collected
 
 if TYPE_CHECKING:
     from orchestrate.config.command_line import Request  # which loads Hydra
@@ -147,8 +144,7 @@ def recorded_launch(
     StoreError, InfrastructureError
         If the database or the workers fail; claims are released if that is possible.
     """
-    opened = Store.open(settings.store_url, settings.lease, settings.patience)
-    with collected(settings, output.warn), opened as store:
+    with Store.open(settings.store_url, settings.lease, settings.patience) as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):
@@ -323,60 +319,6 @@ def free_trials(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> N
         store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
 
 
-REST = 20.0
-"""Least time between two copies, as a multiple of the time that a copy takes."""
-
-
-@contextmanager
-def collected(settings: LaunchSettings, warn: Say) -> Iterator[None]:
-    """Copy the database of the block every ``collect_seconds`` or less often, and once after it.
-
-    What earlier launches of the share have collected, perhaps on machines that are gone, is merged
-    before the block. Without a folder nothing is copied.
-
-    Raises
-    ------
-    StoreError
-        If what was collected cannot be merged, or the last copy fails; the local database is kept.
-    """
-    if settings.collect_in is None:
-        yield
-        return
-    folder, ended = settings.collect_in, threading.Event()
-    earlier = f"*.{settings.share}.*.db"
-    if any(folder.glob(earlier)):
-        for _ in merge_collected(settings.store_url, folder, earlier):
-            pass
-
-    def copy_regularly() -> None:
-        pause = settings.collect_seconds
-        while not ended.wait(pause):
-            start = time.monotonic()
-            try:
-                collect(settings.store_url, folder)
-            except StoreError as error:
-                warn(f"the results are not copied yet: {error}")
-            pause = max(settings.collect_seconds, REST * (time.monotonic() - start))
-
-    thread = threading.Thread(target=copy_regularly, name="collect", daemon=True)
-    thread.start()
-    try:
-        yield
-    except BaseException as error:
-        _stop(thread, ended)
-        if not isinstance(error, DatabaseMovedError):  # another database may have its name
-            with suppress(StoreError):  # the first error is the one to report
-                collect(settings.store_url, folder)
-        raise
-    _stop(thread, ended)
-    collect(settings.store_url, folder)
-
-
-def _stop(thread: threading.Thread, ended: threading.Event) -> None:
-    ended.set()
-    thread.join()
-
-
 MAX_LISTED_CAUSES = 3
 """Causes of failure that the summary lists."""
 
@@ -444,8 +386,6 @@ def checked(request: Request) -> tuple[Grid, LaunchSettings]:
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)
-    if settings.share:
-        grid = grid.only(settings.share.holds)
     if not settings.detach:  # workers may run on other machines
         if any(trial.config.path == "kernel" for trial in grid.trials):
             cache.check_environment()
@@ -461,18 +401,12 @@ def _check_kind(settings: LaunchSettings, *, single: bool) -> None:
             "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
             "-m and a range such as 'seed=range(100)', or leave launch.until out."
         )
-    leaving = settings.detach
-    if single and (leaving or settings.share):
-        key = "launch.detach" if leaving else "launch.share"
+    if settings.detach and single:
         raise LaunchError(
-            f"{key} is for grids, but a single trial is asked for: add -m, or leave {key} out."
+            "launch.detach is for grids, but a single trial is asked for: add -m, or leave "
+            "launch.detach out."
         )
-    if settings.share and (leaving or settings.until):
-        raise LaunchError(
-            f"launch.{'detach' if leaving else 'until'} needs the whole grid in one database, but "
-            "launch.share takes a part of it: leave one of the two out."
-        )
-    if leaving and settings.until:
+    if settings.detach and settings.until:
         raise LaunchError(
             "launch.until looks at results before it asks for more seeds, but launch.detach leaves "
             "before there are any: leave one of the two out."

@@ -1,4 +1,4 @@
-"""Maintenance of databases: backup, upgrade, shared copies, what can be pruned, and examination.
+"""Maintenance of databases: backup, upgrade, what can be pruned, and examination.
 
 In an upgrade the check for running launches, the backup, the migration and the labels of
 configurations are one exclusive transaction. The statements of a schema never change; what the
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -36,7 +35,6 @@ from orchestrate.store.backends.base import (
     dump,
     parse_url,
     public_url,
-    sqlite_path,
     translated,
     translated_file,
 )
@@ -85,44 +83,14 @@ def _copy(parsed: URL, url: str, partial: Path) -> None:
         copy_checked(sqlite.existing_path(parsed), partial)
 
 
-def collect(url: str, folder: Path) -> None:
-    """Copy a SQLite database, which launches may be writing, to a file of its name in a folder.
-
-    Raises ``StoreUnavailableError`` if the folder has no room or fails, and ``StoreError`` if it
-    can never be written; an older copy stays then.
-    """
-    path = sqlite_path(parse_url(url))
-    partial = folder / f"{path.name}.{os.getpid()}.partial"
-    with (
-        translated_file(str(folder)),
-        translated(url),
-        tempfile.TemporaryDirectory(dir=path.parent) as local,
-    ):
-        copy = Path(local) / path.name
-        copy_checked(path, copy)
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            shutil.copyfile(copy, partial)
-            with partial.open("rb") as written:
-                os.fsync(written.fileno())
-            partial.replace(folder / path.name)
-        finally:
-            partial.unlink(missing_ok=True)
-
-
-def merge_collected(
-    url: str, folder: Path, pattern: str = "*.db", trial_key: TrialKey | None = None
-) -> Iterator[Merged]:
-    """Merge the copies in a folder into a database, one after the other.
+def merge_folder(url: str, folder: Path, trial_key: TrialKey | None = None) -> Iterator[Merged]:
+    """Merge the SQLite files in a folder into a database, one after the other.
 
     Raises ``NoDatabaseError`` if it holds none, and as :func:`merge` does.
     """
-    found = sorted(folder.glob(pattern))
+    found = sorted(folder.glob("*.db"))
     if not found:
-        raise NoDatabaseError(
-            f"The folder {folder} holds no database ({pattern}): give one that launches with "
-            "store=shards have written to."
-        )
+        raise NoDatabaseError(f"The folder {folder} holds no database (*.db): give another one.")
     for path in found:
         with tempfile.TemporaryDirectory() as local:
             copy = Path(local) / path.name

@@ -87,10 +87,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["store.url=sqlite:///~nobody-here/r.db"], "is '~nobody-here/r.db', but a path is expec"),
         (["store.url=sqlite:///a\nb.db"], "holds the control character '\\\\n'"),
         (["store.url=postgresql://you:secret@host/a\tb"], "holds the control character '\\\\t'"),
-        (
-            ["-m", "store=shards", "launch.share=1/2", "store.folder=$X/y"],
-            "store.folder is '\\$X/y'",
-        ),
         (["store.url=sqlite:////dev"], "/dev is a folder, but a file is expected"),
         (["--cfg", "jobs"], "--cfg 'jobs' is unknown.* did you mean 'job'"),
         (["--bogus"], "option '--bogus' is unknown"),
@@ -445,7 +441,7 @@ def test_a_grid_goes_on_when_its_output_is_closed(
 
 
 @pytest.mark.parametrize(
-    "word", [name for name in SUCCESSORS if name.startswith(("launch.", "executor="))]
+    "word", [name for name in SUCCESSORS if name.startswith(("launch.", "executor=", "store="))]
 )
 def test_settings_of_a_launch(command_line: Callable[..., tuple[int, str, str]], word: str) -> None:
     code, output, errors = command_line("-m", word if "=" in word else f"{word}=1")

@@ -106,8 +106,9 @@ def refuse_unsafe(path: Path, safe_url: str) -> None:
             "results can be lost or damaged, but a disk of this machine is expected: give a file "
             "on one, such as store.url=sqlite:////var/tmp/results.db (in a container a volume, in "
             "WSL a folder of Linux), and copy it afterwards, use PostgreSQL (store=postgresql), "
-            "which many machines share, or let each machine write a share of the grid to its own "
-            f"disk (store=shards). If you know that it is safe, set {SAFE_VARIABLE}={mount.kind}."
+            "which many machines share, or let each machine write some seeds to its own disk "
+            "(docs/example/share.sh). If you know that it is safe, set "
+            f"{SAFE_VARIABLE}={mount.kind}."
         )
 
 
