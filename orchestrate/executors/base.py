@@ -25,7 +25,7 @@ from typing import Self
 from dopt.errors import UnusableEnvironmentError, unknown_name
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import LaunchSettings
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 

@@ -30,8 +30,7 @@ from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost, executor_factory
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord

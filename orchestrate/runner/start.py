@@ -25,8 +25,7 @@ from dopt.kernel import compiling, kinds_of
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig, labels
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid, build_grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings, build_grid
 from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.base import Executor, Run, executor_factory, make_executor
 from orchestrate.program import ROOT, answered, exit_code, say, tell

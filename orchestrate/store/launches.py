@@ -27,7 +27,7 @@ from sqlalchemy import (
 
 from orchestrate.errors import LaunchAliveError
 from orchestrate.store import schema
-from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
+from orchestrate.store.backend import Backend, LaunchLife, NewTrial
 from orchestrate.store.records import (
     Claim,
     LaunchRecord,

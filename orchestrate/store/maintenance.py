@@ -27,9 +27,8 @@ from sqlalchemy import URL, Connection, bindparam, select, text, update
 from dopt.spec.config import REGISTRIES, config_label, section_class
 from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
 from orchestrate.files import whole
-from orchestrate.store import launches, records, schema
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.base import (
+from orchestrate.store import launches, records, schema, sqlite
+from orchestrate.store.backend import (
     Backend,
     copy_checked,
     dump,

@@ -21,9 +21,8 @@ import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from orchestrate.errors import StoreError
-from orchestrate.store import records
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.base import Backend, parse_url, public_url, sqlite_path
+from orchestrate.store import records, sqlite
+from orchestrate.store.backend import Backend, parse_url, public_url, sqlite_path
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import DTYPE, Array, TrialKey, stored_json, unpack
 from orchestrate.store.schema import (

@@ -27,9 +27,8 @@ from sqlalchemy.exc import DBAPIError
 
 from dopt.errors import suggestion
 from orchestrate.errors import QueryError
-from orchestrate.store import query_process, schema
-from orchestrate.store.backends import postgresql, sqlite
-from orchestrate.store.backends.base import (
+from orchestrate.store import postgresql, query_process, schema, sqlite
+from orchestrate.store.backend import (
     LaunchLife,
     is_of_driver,
     out_of_time,

@@ -39,7 +39,7 @@ from sqlalchemy import (
 )
 
 from orchestrate.errors import StoreError, StoreUnavailableError
-from orchestrate.store.backends.base import Backend
+from orchestrate.store.backend import Backend
 from orchestrate.store.schema import FINISHED, N_ROWS, STEP_VALUES, Outcome, curve, step, trial
 
 Array = npt.NDArray[np.float64]

@@ -23,8 +23,7 @@ from ray.cluster_utils import Cluster
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run
 from orchestrate.runner.start import Work, launch_grid

@@ -26,8 +26,8 @@ from orchestrate.program import SUCCESSORS
 from orchestrate.runner import start
 from orchestrate.runner.start import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
-from orchestrate.store.backends.base import parse_url
-from orchestrate.store.backends.sqlite import existing_path
+from orchestrate.store.backend import parse_url
+from orchestrate.store.sqlite import existing_path
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.pages import commands
 from tests.paths import ROOT

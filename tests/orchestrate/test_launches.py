@@ -17,8 +17,7 @@ from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate import launch
 from orchestrate.__main__ import main
-from orchestrate.config import Combination, Grid, build_grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
 from orchestrate.errors import ExitCode
 from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import Reader

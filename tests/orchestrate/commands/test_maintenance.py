@@ -166,7 +166,7 @@ class TestBackup:
         self, grid: int, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         if url.startswith("sqlite"):
-            monkeypatch.setattr("orchestrate.store.backends.base.sqlite3.connect", short)
+            monkeypatch.setattr("orchestrate.store.backend.sqlite3.connect", short)
         else:
             said = "pg_dump: error: could not write to file: No space left on device"
             program = tmp_path / "bin" / "pg_dump"

@@ -19,9 +19,8 @@ from dopt.policies import POLICIES
 from dopt.registry import build
 from dopt.spec.trial import TrialSpec
 from dopt.systems import NAMED_SYSTEMS
-from orchestrate.config import Combination, build_grid
+from orchestrate.config import Combination, LaunchSettings, build_grid
 from orchestrate.config.command_line import read_command_line
-from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.options import option_names
 from tests.paths import ROOT
 

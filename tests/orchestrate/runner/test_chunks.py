@@ -12,8 +12,7 @@ import pytest
 
 from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Combination, Grid, build_grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
 from orchestrate.errors import LaunchError
 from orchestrate.records import RunRecord
 from orchestrate.runner.saving import RetryingStore

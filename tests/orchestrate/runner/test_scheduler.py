@@ -15,8 +15,7 @@ import pytest
 from dopt.errors import UnusableEnvironmentError
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Event, Executor, Task, WorkerLost, run_task
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES

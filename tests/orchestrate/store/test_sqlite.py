@@ -23,10 +23,10 @@ from orchestrate.store import (
     Store,
     StoreError,
     StoreUnavailableError,
+    sqlite,
 )
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.sqlite import _is_read_only, read_address
 from orchestrate.store.maintenance import examine
+from orchestrate.store.sqlite import _is_read_only, read_address
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
 from tests.orchestrate.store.processes import (
     eight_open,

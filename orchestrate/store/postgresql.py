@@ -31,7 +31,7 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
 from orchestrate.errors import StoreError, StoreUnavailableError
-from orchestrate.store.backends.base import (
+from orchestrate.store.backend import (
     ANNOUNCE_SECONDS,
     Backend,
     LaunchLife,

@@ -44,7 +44,7 @@ from orchestrate.errors import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.backends.base import (
+from orchestrate.store.backend import (
     ANNOUNCE_SECONDS,
     Backend,
     LaunchLife,
