@@ -48,8 +48,9 @@ SUCCESSORS = {
     "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",
     "orchestrate vacuum": "sqlite3 FILE VACUUM, or VACUUM in psql, gives the space back",
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
-    "--live": "look at the progress of a launch with python -m orchestrate status --watch",
-    "launch.live": "look at the progress of a launch with python -m orchestrate status --watch",
+    "--live": "look at the progress of a launch with watch python -m orchestrate status",
+    "launch.live": "look at the progress of a launch with watch python -m orchestrate status",
+    "status --watch": "watch python -m orchestrate status repeats it",
     "launch.reference": "compare with python -m analysis compare --reference POLICY",
     "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
     "launch.until='ci<5%'",
