@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, zip_longest
 from typing import Any, Literal, cast
 
 from dopt.errors import IncompatibleError, SpecificationError, stripped, unknown_name
@@ -104,13 +105,17 @@ def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> 
         size = 1 if combination.seeds is None else len(combination.seeds)
         n_jobs += size
         try:
-            by_config.append(_trials(combination))
+            trial = TrialSpec.from_mapping(combination.settings)
+            seeds = combination.seeds
+            by_config.append([trial] if seeds is None else [trial.with_seed(s) for s in seeds])
         except IncompatibleError as error:
             if single:
                 raise
-            reason = f"{_choices(combination)}: {error}"
+            env, policy = (name_of(combination.settings[key]) for key in ("env", "policy"))
+            reason = f"env={env} policy={policy}: {error}"
             left_out[reason] = left_out.get(reason, 0) + size
-    trials = list({trial.trial_key: trial for trial in _seed_by_seed(by_config)}.values())
+    seed_by_seed = filter(None, chain.from_iterable(zip_longest(*by_config)))
+    trials = list({trial.trial_key: trial for trial in seed_by_seed}.values())
     if not trials:
         raise SpecificationError(
             f"the grid is empty: {' '.join(left_out) or 'no trial was requested'}"
@@ -125,24 +130,6 @@ def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
         having = (one.settings.get(group) for one in combinations if key in one.used)
         names = dict.fromkeys(name_of(part) for part in having if isinstance(part, Mapping))
         yield f"{key} applies to {group}={','.join(names)} only"
-
-
-def _trials(combination: Combination) -> list[TrialSpec]:
-    trial = TrialSpec.from_mapping(combination.settings)
-    if combination.seeds is None:
-        return [trial]
-    return [trial.with_seed(seed) for seed in combination.seeds]
-
-
-def _choices(combination: Combination) -> str:
-    """Return the options of the groups, such as ``env=quadrotor policy=periodic``."""
-    sections = combination.settings.items()
-    return " ".join(f"{key}={name_of(part)}" for key, part in sections if key in ("env", "policy"))
-
-
-def _seed_by_seed(by_config: Sequence[Sequence[TrialSpec]]) -> Iterator[TrialSpec]:
-    for index in range(max(map(len, by_config), default=0)):
-        yield from (trials[index] for trials in by_config if index < len(trials))
 
 
 LARGEST = 1_000_000_000

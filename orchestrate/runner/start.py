@@ -124,7 +124,11 @@ def launch_grid(
 
     def body(store: RetryingStore) -> ExitCode:
         if settings.detach:
-            return leave(store, grid, settings, say)
+            free_trials(store, grid, settings)
+            state = store.register(grid.trials)
+            counts = f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
+            say(f"{counts}; start workers with {WORKER} --db {store.safe_url}")
+            return ExitCode.DONE
         return _run(store, grid, settings, work, output)
 
     return recorded_launch(settings, record, output, body)
@@ -302,15 +306,6 @@ def _count(tally: Tally, state: Registration) -> None:
 WORKER = "python -m orchestrate work"
 
 
-def leave(store: RetryingStore, grid: Grid, settings: LaunchSettings, say: Say) -> ExitCode:
-    """Register the grid for workers."""
-    free_trials(store, grid, settings)
-    state = store.register(grid.trials)
-    counts = f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
-    say(f"{counts}; start workers with {WORKER} --db {store.safe_url}")
-    return ExitCode.DONE
-
-
 def free_trials(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> None:
     """Put the trials of dead launches, and those to be run again, back to pending."""
     store.recover()
@@ -430,6 +425,9 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
     return code
 
 
+_TRACEBACK = "SELECT traceback FROM v_failures WHERE trial_key = :key ORDER BY attempt DESC LIMIT 1"
+
+
 def launch_trial(
     trial: TrialSpec, settings: LaunchSettings, record: LaunchRecord, work: Work
 ) -> tuple[ExitCode, str]:
@@ -454,9 +452,13 @@ def launch_trial(
         if row is None:  # interrupted before it was registered
             return code, f"{_name(trial)} · not started · {reader.safe_url}"
         if row.status == "failed":
-            tell(sys.stderr, _traceback(reader, trial))
-        was_done = row.attempt == before and row.status != "pending"
-        outcome = f"{_already_run(row)} · {_outcome(row)}" if was_done else _outcome(row)
+            found = reader.rows(_TRACEBACK, key=trial.trial_key)
+            tell(sys.stderr, str(found[0][0]) if found else "")
+        outcome = _outcome(row)
+        if row.attempt == before and row.status == "done":
+            outcome = f"already done, nothing to run · {outcome}"
+        elif row.attempt == before and row.status != "pending":
+            outcome = f"already run (launch.retry={row.status} runs it again) · {outcome}"
         return code, f"{_name(trial)} · {outcome} · {reader.safe_url}"
 
 
@@ -481,12 +483,6 @@ def _name(trial: TrialSpec) -> str:
     return " ".join([*words, f"seed={trial.seed}"])
 
 
-def _already_run(row: TrialRow) -> str:
-    if row.status == "done":
-        return "already done, nothing to run"
-    return f"already run (launch.retry={row.status} runs it again)"
-
-
 def _outcome(row: TrialRow) -> str:
     if row.status == "failed":
         return f"failed with {row.error_type}: {row.error_message}"
@@ -498,16 +494,8 @@ def _outcome(row: TrialRow) -> str:
     return f"final loss {row.final_loss:.4g} · best {row.best_loss:.4g} · {steps}"
 
 
-def _traceback(reader: Reader, trial: TrialSpec) -> str:
-    """Return the traceback of the last failure."""
-    rows = reader.rows(
-        "SELECT traceback FROM v_failures WHERE trial_key = :key ORDER BY attempt DESC LIMIT 1",
-        key=trial.trial_key,
-    )
-    return str(rows[0][0]) if rows else ""
-
-
 COUNTS = ("trials", "done", "failed", "to run")
+_COUNTED = {**dict.fromkeys(FINISHED, "done"), "failed": "failed", "cancelled": "failed"}
 
 
 def preview(grid: Grid, url: str, retry: str | None = None) -> str:
@@ -522,7 +510,7 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
         row = rows.setdefault(trial.config_key, Counter())
         row["trials"] += 1
         found = status.get(trial.trial_key)
-        row["to run" if found in again else _heading(found)] += 1
+        row["to run" if found in again else _COUNTED.get(found or "", "to run")] += 1
     configs = list({trial.config_key: trial for trial in grid.trials}.values())
     lines = [["env", "configuration", *COUNTS]]
     for trial, label in zip(configs, _labels(configs), strict=True):
@@ -552,9 +540,3 @@ def _statuses(url: str) -> dict[str, str]:
         return {}
     with reader:
         return dict(map(tuple, reader.rows("SELECT trial_key, status FROM trial")))
-
-
-def _heading(status: str | None) -> str:
-    if status in FINISHED:
-        return "done"
-    return "failed" if status in ("failed", "cancelled") else "to run"

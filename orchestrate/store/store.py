@@ -114,7 +114,10 @@ class Store(Launches):
         backend = make_backend(parse_url(url), lease_seconds, patience)
         try:
             with backend.creation() as connection:
-                schema.create_or_check(connection, backend.safe_url)
+                if schema.is_empty(connection):
+                    schema.create(connection)
+                else:
+                    schema.check(connection, backend.safe_url)
         except BaseException:
             backend.close()
             raise

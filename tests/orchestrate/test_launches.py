@@ -195,18 +195,3 @@ def test_a_share_is_copied_while_it_runs_and_goes_on_elsewhere(
     done = len(trials(f"sqlite:///{copy}"))
     assert [path.name for path in copy.parent.iterdir()] == [copy.name]
     assert f"{min(done, 7)} of 7 already done" in str(share().communicate()[0])
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("env=pendulum", "launch.detach=true"), "launch.detach is for grids"),
-        (("-m", *GRID, "launch.detach=true", "launch.until=ci<5%"), "leaves before there are any"),
-    ],
-)
-def test_what_does_not_go_with_leaving_is_refused(
-    command_line: Launch, words: tuple[str, ...], named: str
-) -> None:
-    code, _, err = command_line(*words)
-    assert code == 2
-    assert named in err

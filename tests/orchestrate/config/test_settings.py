@@ -225,6 +225,8 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.timeout=true", "launch.timeout"),
         ("launch.memory_gib=0", "launch.memory_gib is 0, but null or a number of GiB above 0"),
         ("launch.retry_memory=2", "launch.retry_memory is 2, but there is no limit that it could"),
+        ("launch.retry_memory=1", "launch.retry_memory is 1, but null or a factor above 1, at mo"),
+        ("launch.until=ci<5%", "a single trial is asked for: add -m"),
         ("launch.lease=null", "launch.lease"),
         ("assess.sample_loss=yes please", "'assess' is {'sample_loss': 'yes please'}, but"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
@@ -235,14 +237,6 @@ def test_what_is_refused(command_line: CommandLine, word: str, sentence: str) ->
     code, output, errors = command_line(*TRIAL, word)
     assert (code, output, errors.count("\n")) == (2, "", 1)
     assert sentence in errors
-
-
-def test_a_factor_of_memory_is_above_one(command_line: CommandLine) -> None:
-    code, _, errors = command_line(*TRIAL, "launch.memory_gib=1", "launch.retry_memory=1")
-    assert code == 2
-    assert (
-        "launch.retry_memory is 1, but null or a factor above 1, at most 100, is expected" in errors
-    )
 
 
 GRID = ("-m", "policy=d_optimal,random", "env.horizon=5", "seed=range(20)", "executor=inprocess")
@@ -271,12 +265,6 @@ def test_what_is_no_rule_is_refused(
     code, output, errors = command_line(*GRID, *words)
     assert (code, output, errors.count("\n")) == (2, "", 1)
     assert sentence in errors
-
-
-def test_a_single_trial_has_no_seeds_to_choose_from(command_line: CommandLine) -> None:
-    code, _, errors = command_line("env.horizon=5", "launch.until=ci<5%")
-    assert code == 2
-    assert "a single trial is asked for: add -m" in errors
 
 
 def test_a_dry_run_says_that_these_are_the_most(command_line: CommandLine) -> None:

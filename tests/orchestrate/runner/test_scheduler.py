@@ -34,13 +34,6 @@ from tests.orchestrate.standins import (
 )
 
 
-def test_the_same_command_again_runs_nothing_and_says_so(launches: Launches) -> None:
-    assert launches(quick) == ExitCode.DONE
-    assert "0 of 5 already done, 5 to run" in launches.said[0]
-    assert launches(raising) == ExitCode.DONE
-    assert "5 of 5 already done, nothing to run" in launches.said[-1]
-
-
 def test_a_larger_grid_runs_only_what_is_new(launches: Launches) -> None:
     launches(quick, seeds=3)
     launches(quick, seeds=5)
@@ -92,15 +85,6 @@ def test_a_diverged_trial_is_a_result_that_is_kept(launches: Launches) -> None:
     assert launches.statuses()[BROKEN_SEED] == "diverged"
     assert launches(quick, retry="all") == ExitCode.DONE
     assert launches.statuses()[BROKEN_SEED] == "done"
-
-
-def test_rows_do_not_depend_on_the_executor(launches: Launches) -> None:
-    launches(quick)
-    here = launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t")
-    launches.url = launches.url.replace("results.db", "other.db")
-    launches(quick, executor="local", chunk_seconds=1e-9)
-    assert launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t") == here
-    assert launches.query("SELECT state, host FROM launch") == [("done", "here")]
 
 
 def test_the_trials_of_a_dead_launch_are_taken_over(launches: Launches) -> None:

@@ -13,7 +13,6 @@ from sqlalchemy import text
 
 from dopt.result import Assessment
 from orchestrate.__main__ import main
-from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import (
     NoDatabaseError,
     Reader,
@@ -387,7 +386,7 @@ def test_trials_that_contradict_themselves_stay_out(url: str, other: str) -> Non
     numbers = execute(other, "SELECT trial_id FROM trial WHERE seed > 0 ORDER BY seed")
     for (trial_id,), change in zip(numbers, CHANGES.values(), strict=True):
         execute(other, f"UPDATE {change} WHERE trial_id = {trial_id}")
-    found = merge(url, other, trial_key)
+    found = merge(url, other)
     assert (found.added, len(found.contradictory)) == ({"done": 1}, len(CHANGES))
     assert execute(url, "SELECT trial_key FROM trial") == [(Spec(0).trial_key,)]
 

@@ -26,6 +26,7 @@ from orchestrate.store import (
     Reader,
     Store,
     StoreUnavailableError,
+    backend,
     postgresql,
     sqlite,
 )
