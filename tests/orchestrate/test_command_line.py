@@ -73,6 +73,13 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["width=${wdth}"], "'wdth' not found"),
         (["env=[1"], "cannot read the override 'env=\\[1'"),
         (["env=quadrotor", "policy=periodic"], "eigenmode"),
+        (["-m", "env=quadrotor", "policy=periodic"], "the grid is empty: env=quadrotor"),
+        (["executor.name=locla"], "executor.name 'locla' is unknown.* did you mean 'local'"),
+        *(
+            ([*words, f"executor.device={device}"], f"executor.device is '{device}'")
+            for words in (["executor=lockstep"], ["-m", "seed=0", "executor=lockstep"])
+            for device in ("cuda:99", "banana", "meta")
+        ),
         (["plant=real", "plant.delay=-1"], "plant.delay is -1.0 samples"),
         (["plant=real", "plant.counts=0"], "plant.counts is 0.0"),
         (["plant.delay=1"], "setting of plant 'delay' is unknown"),

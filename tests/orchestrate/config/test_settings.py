@@ -12,7 +12,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import Control
-from dopt.errors import IncompatibleError, SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
@@ -157,25 +156,6 @@ def test_an_integer_and_an_equal_float_name_one_trial() -> None:
         [combination((0,), env={"name": "pendulum", "gamma": gamma}) for gamma in (2, 2.0)]
     )
     assert len(grid.trials) == 1
-
-
-def test_a_pair_that_makes_no_sense_is_left_out_with_the_reason() -> None:
-    periodic = {"name": "periodic"}
-    grid = build_grid([combination(), combination(env={"name": "quadrotor"}, policy=periodic)])
-    [(reason, count)] = grid.left_out.items()
-    assert count == 2
-    assert reason.startswith("env=quadrotor policy=periodic: ")
-    assert "eigenmode" in reason
-    assert len(grid.trials) == 2
-    assert grid.repeats == 0
-
-
-def test_alone_such_a_pair_is_an_error_and_so_is_a_grid_of_nothing_else() -> None:
-    pair = combination(env={"name": "quadrotor"}, policy={"name": "periodic"})
-    with pytest.raises(IncompatibleError):
-        build_grid([pair], single=True)
-    with pytest.raises(SpecificationError, match="the grid is empty: env=quadrotor"):
-        build_grid([pair])
 
 
 OWN_GRID = {"_target_": "tests.dopt.custom_networks.Stack"}

@@ -32,7 +32,6 @@ from tests.orchestrate.standins import (
     deadly,
     exiting,
     malformed,
-    quick,
     raising,
 )
 from tests.orchestrate.unruly import (
@@ -154,10 +153,6 @@ def test_a_long_trial_of_the_kernel_heeds_its_limit(monkeypatch: pytest.MonkeyPa
     assert isinstance(finished.outcome, Failure)
     assert finished.outcome.cause == "timeout"
     assert "in advance" in finished.outcome.traceback
-
-
-def test_no_limit_is_no_limit(launches: Launches) -> None:
-    assert launches(quick, timeout=None) == ExitCode.DONE
 
 
 def test_somebody_elses_timer_goes_on() -> None:

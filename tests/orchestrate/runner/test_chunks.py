@@ -183,26 +183,10 @@ def test_a_trial_that_killed_a_process_goes_alone(store: Store, build: Build) ->
     assert sorted(itertools.chain.from_iterable(found)) == list(range(10))
 
 
-def test_what_this_machine_cannot_build_is_left_to_others(
-    build: Build, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("orchestrate.runner.worker.memory_of_this_machine", lambda: 10)
-    chunks, said = build(trials_of("random", 4), {})
-    assert len(chunks) == 0
-    assert (chunks.left, chunks.left_here, chunks.waiting) == (4, 0, 0)
-    assert said == [one for one in said if "give a lower --processes" in one]
-    chunks.look()
-    assert len(said) == 1
-
-
 def stored(**changes: object) -> OpenConfig:
     spec = short_trial("random", 0)
     content = {**json.loads(spec.config_json), **changes}
     return OpenConfig(1, spec.config_key, json.dumps(content), 3, 0, None, None)
-
-
-def test_a_trial_is_built_from_what_is_stored() -> None:
-    assert trial_of(stored(), 1).trial_key == short_trial("random", 0).trial_key
 
 
 ELSEWHERE = {"_target_": "systems_of_mine.Rocket", "source": "0" * 16}
