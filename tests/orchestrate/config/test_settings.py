@@ -324,34 +324,38 @@ def test_a_setting_holds_for_the_grids_that_have_it(
 SHORT = ("env.horizon=5", "executor=inprocess")
 
 
-def test_a_setting_holds_for_the_choices_that_have_it(command_line: CommandLine) -> None:
-    code, output, errors = command_line(
-        "-m", "env=arm", "policy=random,uniform,d_optimal", "policy.regularization=1e-2,1e-3",
-        "model.depth=1", "seed=0,1", "launch.dry_run=true",
-    )  # fmt: skip
-    assert (code, errors) == (0, "")
-    assert "policy.regularization applies to policy=d_optimal only\n" in output
-    assert "model.depth" not in output
-    assert "8 trials, 0 done, 8 to run" in output  # 2 random, 2 uniform, 4 D-optimal
-
-
 @pytest.mark.parametrize(
-    ("choice", "setting", "note"),
+    ("words", "note", "trials"),
     [
-        ("policy=beyond/exact,beyond/trace", "policy.budget_us=20", ""),
-        ("policy=d_optimal,beyond/exact", "policy.candidates=8", "policy=exact"),
-        ("learner=ekf,adam_window", "learner.forgetting=0.99", "learner=ekf"),
-        ("task=none,control", "task.steps=60", "task=control"),
+        (  # 2 random, 2 uniform, 4 D-optimal
+            "env=arm policy=random,uniform,d_optimal policy.regularization=1e-2,1e-3 model.depth=1 "
+            "seed=0,1",
+            "policy.regularization applies to policy=d_optimal only\n",
+            8,
+        ),
+        ("policy=beyond/exact,beyond/trace policy.budget_us=20 seed=0", "", 2),
+        (
+            "policy=d_optimal,beyond/exact policy.candidates=8 seed=0",
+            "policy.candidates applies to policy=exact only\n",
+            2,
+        ),
+        (
+            "learner=ekf,adam_window learner.forgetting=0.99 seed=0",
+            "learner.forgetting applies to learner=ekf only\n",
+            2,
+        ),
+        ("task=none,control task.steps=60 seed=0", "task.steps applies to task=control only\n", 2),
+        ("policy=random,oracle model.depth=3 seed=0", "model.depth applies to model=mlp only\n", 2),
     ],
 )
-def test_a_single_value_may_be_one_that_the_default_choice_lacks(
-    command_line: CommandLine, choice: str, setting: str, note: str
+def test_a_setting_holds_for_the_choices_that_have_it(
+    command_line: CommandLine, words: str, note: str, trials: int
 ) -> None:
-    code, output, errors = command_line("-m", choice, setting, "seed=0", "launch.dry_run=true")
+    code, output, errors = command_line("-m", *words.split(), "launch.dry_run=true")
     assert (code, errors) == (0, "")
-    key = setting.partition("=")[0]
-    assert output.startswith(f"{key} applies to {note} only\n") == bool(note)
-    assert "2 trials, 0 done, 2 to run" in output
+    assert output.startswith(note or "env ")
+    assert output.count(" applies to ") == bool(note)
+    assert f"{trials} trials, 0 done, {trials} to run" in output
 
 
 def test_a_setting_of_the_launch_may_refer_to_one_of_a_trial(
@@ -360,19 +364,3 @@ def test_a_setting_of_the_launch_may_refer_to_one_of_a_trial(
     named = "store.url=sqlite:///of${env.horizon}.db"
     assert command_line("-m", "policy=random,oracle", "seed=0", named, *SHORT)[0] == 0
     assert (tmp_path / "of5.db").exists()
-
-
-def test_a_setting_of_a_model_that_one_policy_brings_along(command_line: CommandLine) -> None:
-    code, output, _ = command_line(
-        "-m", "policy=random,oracle", "model.depth=3", "seed=0", "launch.dry_run=true"
-    )
-    assert code == 0
-    assert output.startswith("model.depth applies to model=mlp only\n")
-    assert "2 trials" in output
-
-
-def test_a_helper_that_another_setting_refers_to_is_read(command_line: CommandLine) -> None:
-    arguments = ("-m", "+strength=3,4", "env.gamma=${strength}", "seed=0", "launch.dry_run=true")
-    code, output, errors = command_line(*arguments)
-    assert (code, errors) == (0, "")
-    assert "2 trials" in output

@@ -152,16 +152,16 @@ def test_nothing_starts_that_may_end_too_late(build: Build) -> None:
     assert late.waiting == 100
 
 
-def test_the_first_trial_of_its_kind_may_take_half_of_the_time(build: Build) -> None:
-    chunks, _ = build(trials_of("random", 5), {}, length=100.0)
-    assert len(chunks.next()) == 1
-    chunks.pending = 2
-    assert len(chunks) == 0
-
-
-def test_what_runs_counts_for_what_waits_behind_it(build: Build) -> None:
-    chunks, _ = build(trials_of("random", 50), {"random": 3.0}, length=8.0)
-    chunks.next()
+@pytest.mark.parametrize(
+    ("measured", "length", "size"),
+    [({}, 100.0, 1), ({"random": 3.0}, 8.0, 1)],
+    ids=["the first of its kind may take half of the time", "what runs counts for what waits"],
+)
+def test_a_process_that_is_busy_leaves_no_time(
+    build: Build, measured: dict[str, float], length: float, size: int
+) -> None:
+    chunks, _ = build(trials_of("random", 50), measured, length=length)
+    assert len(chunks.next()) == size
     assert len(chunks) > 0
     chunks.pending = 2
     assert len(chunks) == 0
