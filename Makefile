@@ -96,7 +96,7 @@ lint: setup  ## check style and types
 	$(BIN)/zizmor --quiet --offline .github
 	$(BIN)/hadolint --failure-threshold warning docker/Dockerfile .ci/postgres/Dockerfile
 	$(BIN)/check-jsonschema --quiet --builtin-schema vendor.compose-spec docker/compose.yaml docker/compose.hosts.yaml
-	$(BIN)/shellcheck docker/*.sh orchestrate/executors/slurm/task.sh .ci/run .ci/image .ci/packages .ci/start_postgres .ci/postgres/*.sh
+	$(BIN)/shellcheck docker/*.sh docs/example/*.sh .ci/run .ci/image .ci/packages .ci/start_postgres .ci/postgres/*.sh
 
 format: setup  ## apply the style
 	$(BIN)/ruff check --fix .

@@ -15,8 +15,7 @@ from pathlib import Path
 from dopt.kernel import compiling
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import Claim, LaunchRecord, Reader, RunRecord, Store

@@ -359,7 +359,7 @@ def source_map() -> str:
         files = [one for one in sorted(folder.glob("*.py")) if not one.name.startswith("__")]
         lines += [f"  {one.name:<20}{said(one)}" for one in files]
         for one in sorted(folder.glob("*/__init__.py")):
-            if (name := one.parent.name) not in {"store", "backends"}:
+            if (name := one.parent.name) != "store":
                 lines.append(f"  {name + '/':<20}{said(one)}")
     return "```text\n" + "\n".join(lines) + "\n```\n"
 

@@ -48,8 +48,9 @@ SUCCESSORS = {
     "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",
     "orchestrate vacuum": "sqlite3 FILE VACUUM, or VACUUM in psql, gives the space back",
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
-    "--live": "look at the progress of a launch with python -m orchestrate status --watch",
-    "launch.live": "look at the progress of a launch with python -m orchestrate status --watch",
+    "--live": "look at the progress of a launch with watch python -m orchestrate status",
+    "launch.live": "look at the progress of a launch with watch python -m orchestrate status",
+    "status --watch": "watch python -m orchestrate status repeats it",
     "launch.reference": "compare with python -m analysis compare --reference POLICY",
     "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
     "launch.until='ci<5%'",
@@ -59,6 +60,10 @@ SUCCESSORS = {
     "export bundle": "copy trials into a file with python -m orchestrate merge OTHER --db "
     "sqlite:///FILE, or export trials, curves, trajectories and assessments as Parquet",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
+    "executor=slurm": "register the grid with launch.detach=true, and submit its workers with "
+    "sbatch docs/example/slurm_workers.sh",
+    "store=shards": "docs/example/share.sh runs a share of the seeds and copies its database",
+    "launch.share": "docs/example/share.sh runs a share of the seeds and copies its database",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
     "experiment=flex_table1_agents": "studies/agents/README.md has it as experiment=agents",

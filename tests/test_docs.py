@@ -40,15 +40,11 @@ SHELL = {
     "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_explorer.py
     "docs/install.md": {".", "make"},
     "docs/many_machines.md": {
-        "sh",
-        "export",
-        "docker",
-        "mkdir",
-        "git",
-        "make",
-        "set",
-        "ray",
-        "kubectl",
+        *("sh", "export", "docker", "mkdir", "git", "make", "set", "ray", "kubectl"),
+        *(
+            "bash",
+            "sbatch",
+        ),  # docs/example: tests/orchestrate/test_launches.py, test_slurm_workers.py
     },
     "README.md": {"make"},
 }

@@ -30,7 +30,7 @@ from analysis.data.selection import Selection, select
 from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
-from orchestrate.store.backends.base import parse_url, public_url, read_login, sqlite_path
+from orchestrate.store.backend import parse_url, public_url, read_login, sqlite_path
 
 E = TypeVar("E", bound=StrEnum)
 

@@ -172,13 +172,9 @@ def chosen(reader: Reader, arguments: argparse.Namespace) -> list[ConfigRow]:
     """
     configs = reader.configs()
     for column in ("env", "policy"):
-        configs = _filtered(configs, column, getattr(arguments, column))
+        names, known = getattr(arguments, column), {getattr(one, column) for one in configs}
+        for name in names:
+            if known and name not in known:
+                raise UsageError(str(unknown_name(column, name, known)))
+        configs = [one for one in configs if not names or getattr(one, column) in names]
     return configs
-
-
-def _filtered(configs: list[ConfigRow], column: str, names: Sequence[str]) -> list[ConfigRow]:
-    known = {getattr(config, column) for config in configs}
-    for name in names:
-        if known and name not in known:
-            raise UsageError(str(unknown_name(column, name, known)))
-    return [config for config in configs if not names or getattr(config, column) in names]

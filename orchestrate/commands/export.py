@@ -130,7 +130,9 @@ def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict
     _expect_trials(reader, configs, wanted)
     with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
         content = _write(reader, configs, wanted, out)
-        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": digest(out)}
+        with out.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": digest}
         document = {
             "kind": wanted.kind,
             "format": wanted.format,
@@ -140,12 +142,6 @@ def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict
         }
         manifest.write_text(json.dumps(document, indent=2) + "\n")
     return document
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -21,7 +20,7 @@ from orchestrate.store.maintenance import (
     Upgrade,
     back_up,
     examine,
-    merge_collected,
+    merge_folder,
     prunable,
     upgrade,
 )
@@ -36,7 +35,7 @@ def _add_merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "other",
         metavar="OTHER",
-        help="file or URL of the other database, or folder of shards",
+        help="file or URL of the other database, or folder of SQLite files",
     )
 
 
@@ -51,14 +50,11 @@ def _run_merge(arguments: argparse.Namespace) -> ExitCode:
 
 def _merge(url: str, other: str) -> Merged:
     if "://" in other:
-        return merge(url, other, trial_key)
+        return merge(url, other)
     place = given_path(other, "OTHER", UsageError)
-    if not place.is_dir():
-        return merge(url, f"sqlite:///{place.absolute()}", trial_key)
-    total = Merged()
-    for merged in merge_collected(url, place, trial_key=trial_key):
-        total.include(merged)
-    return total
+    if place.is_dir():
+        return merge_folder(url, place)
+    return merge(url, f"sqlite:///{place.absolute()}")
 
 
 def _merge_lines(merged: Merged) -> list[str]:
@@ -92,18 +88,13 @@ MERGE_COMMAND = Command(
 
 def _run_doctor(arguments: argparse.Namespace) -> ExitCode:
     """Print the findings; exit code 1 if results cannot be trusted."""
-    findings = examine(arguments.db, trial_key)
+    findings = examine(arguments.db)
     if arguments.json:
         say_json([asdict(one) for one in findings])
     else:
         show(*map(plain, _doctor_lines(findings)))
     errors = any(one.severity == "error" for one in findings)
     return ExitCode.SOME_FAILED if errors else ExitCode.DONE
-
-
-def trial_key(config_json: str, seed: int) -> str:
-    """Return the key of a trial as :class:`dopt.spec.trial.TrialSpec` makes it."""
-    return hashlib.sha256(f'{config_json[:-1]},"seed":{seed}}}'.encode()).hexdigest()
 
 
 def _doctor_lines(findings: list[Finding]) -> list[str]:

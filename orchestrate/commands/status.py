@@ -1,25 +1,22 @@
-"""Commands on a grid that runs: ``status``, once or repeatedly, and ``work``."""
+"""Commands on a grid that runs: ``status`` and ``work``."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
-from rich.console import Group, RenderableType
-from rich.live import Live
+from rich.console import RenderableType
 from rich.text import Text
 
 from orchestrate.commands import (
     Command,
     add_filters,
     chosen,
-    console,
     plain,
     say,
     say_json,
@@ -30,7 +27,7 @@ from orchestrate.errors import ExitCode, without_password
 from orchestrate.program import as_started, length_of_time, positive, tell
 from orchestrate.program import say as say_still
 from orchestrate.runner.progress import duration
-from orchestrate.store import ExplorationRow, FailureKind, LaunchRow, Reader, StoreUnavailableError
+from orchestrate.store import FailureKind, LaunchRow, Reader
 
 MAX_ROWS = 60
 """Rows of the table without --all."""
@@ -41,42 +38,19 @@ def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--all", action="store_true", help=f"a row for each configuration, also above {MAX_ROWS}"
     )
-    parser.add_argument(
-        "--watch",
-        nargs="?",
-        type=positive("--watch", float),
-        const=0.0,
-        metavar="SECONDS",
-        help="repeat until the grid is complete: every 2 s in a terminal, one line every 10 s "
-        "elsewhere; exit code 1 if trials failed",
-    )
 
 
 def _run_status(arguments: argparse.Namespace) -> ExitCode:
-    """Print the status once, or until the grid is complete."""
-    with Reader.open(arguments.db) as reader:
-        if arguments.watch is None:
-            status = _look(reader, arguments)
-            _show(status, arguments, reader.safe_url)
-            return ExitCode.DONE
-        status = watch(lambda: _look(reader, arguments), arguments.watch, quiet=arguments.json)
-        if arguments.json:
-            _show(status, arguments, reader.safe_url)
-        return ExitCode.SOME_FAILED if status.counts["failed"] else ExitCode.DONE
-
-
-def _show(status: Status, arguments: argparse.Namespace, database: str) -> None:
+    """Print the status."""
+    with Reader.open(arguments.db) as reader, reader.moment() as moment:
+        status = gather(moment, chosen(moment, arguments))
     if arguments.json:
-        say_json(document(status, database))
+        say_json(document(status, reader.safe_url))
     elif not status.configs:
-        say(f"{database} holds no trials yet: run a launch that writes to it.")
+        say(f"{reader.safe_url} holds no trials yet: run a launch that writes to it.")
     else:
         show(*parts(status, len(status.configs) if arguments.all else MAX_ROWS))
-
-
-def _look(reader: Reader, arguments: argparse.Namespace) -> Status:
-    with reader.moment() as moment:
-        return gather(moment, chosen(moment, arguments))
+    return ExitCode.DONE
 
 
 STATUS_COMMAND = Command(
@@ -119,7 +93,9 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
         )
     if status.explorations:
         yield Text("\nExplorations", style="bold")
-        yield from map(_exploration, status.explorations[-_MAX_EXPLORATIONS:])
+        for one in status.explorations[-_MAX_EXPLORATIONS:]:
+            name = f"{one.env}, {one.label}, seed {one.seed}"
+            yield plain(f"  {one.trial_key[:12]}  {name}: {one.state}")
     if status.failures:
         yield Text("\nFailures", style="bold red")
         yield from map(_failure, status.failures[:_MAX_KINDS])
@@ -128,15 +104,13 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
     detached = status.detached if status.left else ()
     if status.launches or detached:
         yield Text("\nLaunches", style="bold")
-        yield from map(_detached, detached)
+        for launch in detached:
+            where = f"{launch.launch_id} on {launch.host}, {launch.started[:19]}Z"
+            yield Text(f"  {where}: registered a grid for workers")
         yield from map(_launch, status.launches)
     if status.left and not status.launches:
         again = f"start workers with {WORK}" if detached else "run the same launch command again"
         yield Text(f"\nNo {'worker' if detached else 'launch'} is running: {again} to continue.")
-
-
-def _exploration(one: ExplorationRow) -> Text:
-    return plain(f"  {one.trial_key[:12]}  {one.env}, {one.label}, seed {one.seed}: {one.state}")
 
 
 def _failure(kind: FailureKind) -> Text:
@@ -150,11 +124,6 @@ def _failure(kind: FailureKind) -> Text:
     for line in [*lines, last, *([f"at {kind.place}"] if kind.place else [])]:
         text.append("\n      ").append(plain(_first_line(line)))
     return text
-
-
-def _detached(launch: LaunchRow) -> Text:
-    since = f"{launch.started[:19]}Z"
-    return Text(f"  {launch.launch_id} on {launch.host}, {since}: registered a grid for workers")
 
 
 def _launch(launch: LaunchRow) -> Text:
@@ -200,57 +169,6 @@ def _plural(number: int, noun: str) -> str:
 def _first_line(text: str) -> str:
     line = text.strip().splitlines()[0] if text.strip() else ""
     return line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…"
-
-
-TERMINAL_INTERVAL_SECONDS = 2.0
-LINE_INTERVAL_SECONDS = 10.0
-
-_LINES_BESIDE_GRID = 14  # of the screen, above and below the grid
-
-Read = Callable[[], Status]
-
-
-def watch(read: Read, seconds: float | None, quiet: bool) -> Status:
-    """Show what ``read`` returns until every trial has an outcome; return the last status.
-
-    A database that cannot be reached is read again later.
-    """
-    terminal = sys.stdout.isatty() and not quiet
-    statuses = _statuses(
-        read, seconds or (TERMINAL_INTERVAL_SECONDS if terminal else LINE_INTERVAL_SECONDS)
-    )
-    if terminal:
-        _in_place(statuses)
-    else:
-        for status in statuses:
-            if not quiet:
-                say(status if isinstance(status, str) else summary(status))
-    return read()
-
-
-def _statuses(read: Read, seconds: float) -> Iterator[Status | str]:
-    """Yield the status, or the error of a failed read, until the grid is complete."""
-    while True:
-        try:
-            status = read()
-        except StoreUnavailableError as error:
-            if not error.transient:
-                raise
-            yield str(error)
-        else:
-            yield status
-            if status.configs and not status.left:
-                return
-        time.sleep(seconds)
-
-
-def _in_place(statuses: Iterable[Status | str]) -> None:
-    screen = console()
-    with Live(console=screen, auto_refresh=False) as live:
-        for status in statuses:
-            rows = max(4, screen.height - _LINES_BESIDE_GRID)
-            shown = Text(status) if isinstance(status, str) else Group(*parts(status, rows))
-            live.update(shown, refresh=True)
 
 
 def _add_work_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,18 +1,23 @@
 """Configuration of a launch: overrides, sweeps and the grid of trials that they ask for.
 
-This module holds the grid, built from the combinations of a command line.
+This module holds the grid, built from the combinations of a command line, and the settings of the
+launch as checked values, none of which is part of a trial. A refusal names the key, the value and
+the range.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, zip_longest
+from typing import Any, Literal, cast
 
-from dopt.errors import IncompatibleError, SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError, stripped, unknown_name
 from dopt.registry import name_of
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
+from orchestrate.errors import LaunchError
 
 TRIAL_SECTIONS = (
     *("env", "plant", "policy", "model", "learner"),
@@ -70,12 +75,6 @@ class Grid:
         """Number of jobs that repeat a trial."""
         return self.n_jobs - sum(self.left_out.values()) - len(self.trials)
 
-    def only(self, wanted: Callable[[str], bool]) -> Grid:
-        """Return the grid with the trials whose keys are wanted."""
-        trials = [trial for trial in self.trials if wanted(trial.trial_key)]
-        n_jobs = self.n_jobs - len(self.trials) + len(trials)
-        return dataclasses.replace(self, trials=trials, n_jobs=n_jobs)
-
     def on_path(self, path: str) -> Grid:
         """Return the grid with its trials on an execution path."""
         configs: dict[str, TrialConfig] = {}
@@ -106,13 +105,17 @@ def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> 
         size = 1 if combination.seeds is None else len(combination.seeds)
         n_jobs += size
         try:
-            by_config.append(_trials(combination))
+            trial = TrialSpec.from_mapping(combination.settings)
+            seeds = combination.seeds
+            by_config.append([trial] if seeds is None else [trial.with_seed(s) for s in seeds])
         except IncompatibleError as error:
             if single:
                 raise
-            reason = f"{_choices(combination)}: {error}"
+            env, policy = (name_of(combination.settings[key]) for key in ("env", "policy"))
+            reason = f"env={env} policy={policy}: {error}"
             left_out[reason] = left_out.get(reason, 0) + size
-    trials = list({trial.trial_key: trial for trial in _seed_by_seed(by_config)}.values())
+    seed_by_seed = filter(None, chain.from_iterable(zip_longest(*by_config)))
+    trials = list({trial.trial_key: trial for trial in seed_by_seed}.values())
     if not trials:
         raise SpecificationError(
             f"the grid is empty: {' '.join(left_out) or 'no trial was requested'}"
@@ -129,19 +132,187 @@ def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
         yield f"{key} applies to {group}={','.join(names)} only"
 
 
-def _trials(combination: Combination) -> list[TrialSpec]:
-    trial = TrialSpec.from_mapping(combination.settings)
-    if combination.seeds is None:
-        return [trial]
-    return [trial.with_seed(seed) for seed in combination.seeds]
+LARGEST = 1_000_000_000
+"""Bound of seconds and GiB: system timers and limits overflow above it."""
+
+_PRECISION = re.compile(r"ci\s*<\s*(\d+(?:\.\d+)?)\s*%")
 
 
-def _choices(combination: Combination) -> str:
-    """Return the options of the groups, such as ``env=quadrotor policy=periodic``."""
-    sections = combination.settings.items()
-    return " ".join(f"{key}={name_of(part)}" for key, part in sections if key in ("env", "policy"))
+def section(key: str, value: object) -> Mapping[str, Any]:
+    """Return a mapping of settings."""
+    if isinstance(value, Mapping):
+        return value
+    raise wrong(key, value, "a section with settings of its own")
 
 
-def _seed_by_seed(by_config: Sequence[Sequence[TrialSpec]]) -> Iterator[TrialSpec]:
-    for index in range(max(map(len, by_config), default=0)):
-        yield from (trials[index] for trials in by_config if index < len(trials))
+def flag(key: str, value: object) -> bool:
+    """Return a boolean."""
+    if isinstance(value, bool):
+        return value
+    raise wrong(key, value, "true or false")
+
+
+def text(key: str, value: object) -> str:
+    """Return a non-empty text."""
+    if isinstance(value, str) and value:
+        return value
+    raise wrong(key, value, "a text")
+
+
+def count(key: str, value: object) -> int | None:
+    """Return a positive whole number, or None."""
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
+        return value
+    raise wrong(key, value, "null or a whole number above 0")
+
+
+def limit(key: str, value: object, unit: str) -> float | None:
+    """Return a positive number, or None for no limit."""
+    return None if value is None else amount(key, value, unit, "null or a number")
+
+
+def amount(key: str, value: object, unit: str, kind: str = "a number") -> float:
+    """Return a positive number below :data:`LARGEST`."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < LARGEST:
+        return float(value)
+    raise wrong(key, value, f"{kind} of {unit} above 0 and below {LARGEST:,}")
+
+
+def factor(key: str, value: object, limit_key: str, limited: object) -> float | None:
+    """Return a factor by which a limit is raised, which has to be set; or None."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 < value <= 100:
+        raise wrong(key, value, "null or a factor above 1, at most 100,")
+    if limited is None:
+        raise LaunchError(
+            f"{key} is {value:g}, but there is no limit that it could raise: set {limit_key}, or "
+            f"leave {key} out."
+        )
+    return float(value)
+
+
+def wrong(key: str, value: object, expected: str) -> LaunchError:
+    """Return the error for a setting with an invalid value."""
+    return LaunchError(f"{key} is {value!r}, but {expected} is expected: change {key}.")
+
+
+def precision(key: str, value: object) -> float | None:
+    """Return the share of a mean to within which it shall be known: 0.05 for ``ci<5%``, or None."""
+    match = _PRECISION.fullmatch(value.strip()) if isinstance(value, str) else None
+    if match and 0 < float(match[1]) < 100:
+        return float(match[1]) / 100
+    if value is None:
+        return None
+    raise wrong(
+        key,
+        value,
+        "null or ci<P% with P above 0 and below 100 (the geometric mean of the final loss is known "
+        "to within P percent), such as 'ci<5%',",
+    )
+
+
+RETRY = ("failed", "diverged", "all")
+
+Retry = Literal["failed", "diverged", "all"]
+
+
+@dataclasses.dataclass(frozen=True)
+class LaunchSettings:
+    """Settings of one launch.
+
+    Attributes
+    ----------
+    executor
+        Name in :data:`orchestrate.executors.base.EXECUTORS`.
+    store_url
+        SQLAlchemy URL of the results database.
+    detach
+        Register the grid and leave; workers run it.
+    retry
+        Finished trials of the grid that are run again.
+    until
+        Precision of the geometric mean of the final loss, as a share of it, at which a
+        configuration gets no more of its seeds; None to run all.
+    workers
+        Processes, or None for one on each core.
+    chunk_seconds
+        Work that a worker gets at once.
+    timeout
+        Seconds of wall time that one trial may take, or None for no limit.
+    memory_gib
+        Memory that one worker process may take, or None for no limit.
+    retry_memory
+        Factor on ``memory_gib`` with which a trial that runs out of memory runs once more, or None.
+    lease
+        Seconds after its last heartbeat for which a launch on PostgreSQL keeps its trials.
+    patience
+        Seconds that a launch waits for a database that cannot be reached.
+    ray_address
+        "local" for a Ray of its own, or HOST:PORT of the head of a cluster.
+    executor_options
+        Section ``executor`` without its name; the executor checks it.
+    """
+
+    executor: str
+    store_url: str
+    dry_run: bool = False
+    detach: bool = False
+    fail_fast: bool = False
+    retry: Retry | None = None
+    until: float | None = None
+    workers: int | None = None
+    chunk_seconds: float = 1.0
+    timeout: float | None = 3600.0
+    memory_gib: float | None = None
+    retry_memory: float | None = None
+    lease: float = 60.0
+    patience: float = 30.0
+    ray_address: str = "local"
+    executor_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, Any]) -> LaunchSettings:
+        """Check the sections ``launch``, ``store`` and ``executor`` of a configuration.
+
+        Raises
+        ------
+        LaunchError
+            If a value has the wrong type or is out of bounds.
+        """
+        launch = section("launch", given["launch"])
+        store, executor = section("store", given["store"]), section("executor", given["executor"])
+        memory_gib = limit("launch.memory_gib", launch["memory_gib"], "GiB")
+        retry = launch["retry"]
+        if retry is not None and retry not in RETRY:
+            raise unknown_name("launch.retry", retry, RETRY)
+        return cls(
+            executor=text("executor.name", executor["name"]),
+            store_url=stripped(text("store.url", store["url"]), "store.url", LaunchError),
+            dry_run=flag("launch.dry_run", launch["dry_run"]),
+            detach=flag("launch.detach", launch["detach"]),
+            fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
+            retry=cast("Retry | None", retry),
+            until=precision("launch.until", launch["until"]),
+            workers=count("launch.workers", launch["workers"]),
+            chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
+            timeout=limit("launch.timeout", launch["timeout"], "seconds"),
+            memory_gib=memory_gib,
+            retry_memory=factor(
+                "launch.retry_memory", launch["retry_memory"], "launch.memory_gib", memory_gib
+            ),
+            **_lease_and_patience(launch["lease"], launch["patience"]),
+            ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
+            executor_options={key: value for key, value in executor.items() if key != "name"},
+        )
+
+
+def _lease_and_patience(lease: object, patience: object) -> dict[str, Any]:
+    """Check that a launch gives up waiting for its database before its lease ends."""
+    seconds = {
+        "lease": amount("launch.lease", lease, "seconds"),
+        "patience": amount("launch.patience", patience, "seconds"),
+    }
+    if seconds["patience"] >= seconds["lease"]:
+        raise wrong("launch.patience", patience, f"less than launch.lease={lease}")
+    return seconds

@@ -13,7 +13,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,7 +55,6 @@ _OPTIONS = (
 )
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
-_PATHS = ("store.url", "store.folder", "executor.logs")
 _UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
 """Path with a character that Hydra takes in quotes alone."""
 
@@ -108,7 +107,7 @@ def read_command_line() -> Request | None:
     register()
     answer = io.StringIO()
     words = _of_launch(words) if grid else words
-    with _arguments([*options, *words]), _errors_let_through():
+    with _hydra_called_with([*options, *words]):
         try:
             with contextlib.redirect_stdout(answer):
                 if options or any(map(_OF_HYDRA.match, words)):
@@ -116,8 +115,11 @@ def read_command_line() -> Request | None:
                     hydra.main(version_base="1.3", config_path=folder, config_name="config")(
                         capture
                     )()
-                else:
-                    _call_with_composed(capture, words)
+                else:  # as hydra.main does, which composes everything twice
+                    with hydra.initialize_config_dir(str(CONFIGURATION), version_base="1.3"):
+                        config = hydra.compose("config", list(words), return_hydra_config=True)
+                        HydraConfig.instance().set_config(config)
+                        capture(config)
         finally:
             if text := answer.getvalue():
                 sys.stdout.write(as_started(text))
@@ -125,14 +127,6 @@ def read_command_line() -> Request | None:
     if isinstance(request, Exception):
         raise request
     return request
-
-
-def _call_with_composed(task: Callable[[DictConfig], None], words: Sequence[str]) -> None:
-    """Call ``task`` as :func:`hydra.main` does, which composes everything twice."""
-    with hydra.initialize_config_dir(str(CONFIGURATION), version_base="1.3"):
-        config = hydra.compose("config", list(words), return_hydra_config=True)
-        HydraConfig.instance().set_config(config)
-        task(config)
 
 
 def _parser() -> Parser:
@@ -196,7 +190,7 @@ def _quoted(word: str) -> str:
     """Return ``launch.until=ci<5%`` or a path with the quotes that Hydra requires around them."""
     key, _, value = word.partition("=")
     rule = key.lstrip("+") == "launch.until" and value.startswith("ci")
-    if rule or (key.lstrip("+") in _PATHS and _UNQUOTED.fullmatch(value)):
+    if rule or (key.lstrip("+") == "store.url" and _UNQUOTED.fullmatch(value)):
         return f"{key}='{value}'"
     return word
 
@@ -216,26 +210,20 @@ def _of_launch(words: Sequence[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def _arguments(words: Sequence[str]) -> Iterator[None]:
-    before = list(sys.argv)
+def _hydra_called_with(words: Sequence[str]) -> Iterator[None]:
+    """Give Hydra the words, and let it raise its errors in place of printing them.
+
+    Workers do not inherit the setting.
+    """
+    arguments, before = list(sys.argv), os.environ.get("HYDRA_FULL_ERROR")
     sys.argv[1:] = words
-    try:
-        yield
-    finally:
-        sys.argv[:] = before
-
-
-@contextlib.contextmanager
-def _errors_let_through() -> Iterator[None]:
-    """Make Hydra raise its errors instead of printing them; workers do not inherit the setting."""
-    before = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
+        sys.argv[:] = arguments
+        del os.environ["HYDRA_FULL_ERROR"]
+        if before is not None:
             os.environ["HYDRA_FULL_ERROR"] = before
 
 

@@ -50,6 +50,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from dopt.errors import DoptError, SpecificationError, suggestion, unknown_name
 from dopt.registry import TARGET, imported
+from orchestrate.config import TRIAL_SECTIONS
 from orchestrate.program import removed_word
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
@@ -220,7 +221,7 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         _check_key(override)
         found = _swept_values(override)
         texts = tuple(map(_text, found))
-        values = tuple(map(_unquoted, found))
+        values = tuple(one.text if isinstance(one, QuotedString) else one for one in found)
     options = loader.get_group_options(override.key_or_group, results_filter=None)
     if options and not any(isinstance(value, dict) for value in values):
         if None in values:
@@ -307,10 +308,6 @@ def _text(value: Any) -> str:
     return text
 
 
-def _unquoted(value: object) -> object:
-    return value.text if isinstance(value, QuotedString) else value
-
-
 def _plain(value: object) -> bool:
     """Return whether ``value`` is a plain value, with no interpolation."""
     if isinstance(value, str):
@@ -320,15 +317,11 @@ def _plain(value: object) -> bool:
 
 def _without_clash(axis: Axis, axes: Sequence[Axis]) -> Axis:
     """Turn a scalar into an edit if another override changes the same part of the tree."""
-    edits = (other for other in axes if other is not axis and other.kind != "choice")
-    if axis.kind == "scalar" and any(_overlap(axis.key, other.key) for other in edits):
+    edits = (_path(other.key) for other in axes if other is not axis and other.kind != "choice")
+    pairs = (zip(_path(axis.key), edit, strict=False) for edit in edits)
+    if axis.kind == "scalar" and any(all(a == b for a, b in one) for one in pairs):
         return dataclasses.replace(axis, kind="edit")
     return axis
-
-
-def _overlap(one: str, other: str) -> bool:
-    pairs = zip(_path(one), _path(other), strict=False)
-    return all(a == b for a, b in pairs)
 
 
 def _path(key: str) -> list[str]:
@@ -375,12 +368,13 @@ def option_names(group: str) -> list[str]:
 @functools.cache
 def _classes() -> Mapping[str, Mapping[str, object]]:
     """Return the options that are classes without a file: path, and default section."""
-    options = {path: _section(name, cls) for path, name, cls in _named()}
-    return {
-        path: section
-        for path, section in options.items()
-        if not (CONFIGURATION / f"{path}.yaml").exists()
-    }
+    options = {}
+    for path, name, cls in _named():
+        if not (CONFIGURATION / f"{path}.yaml").exists():
+            fields = {field.name: field.default for field in dataclasses.fields(cls)}
+            listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
+            options[path] = {"name": name, **listed}
+    return options
 
 
 def _named() -> Iterator[tuple[str, str, type]]:
@@ -403,27 +397,7 @@ def _named() -> Iterator[tuple[str, str, type]]:
         yield f"task/{name}", name, task
 
 
-def _section(name: str, cls: type) -> dict[str, object]:
-    fields = {field.name: field.default for field in dataclasses.fields(cls)}
-    listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
-    return {"name": name, **listed}
-
-
-KNOWN = (
-    "env",
-    "plant",
-    "policy",
-    "model",
-    "learner",
-    "task",
-    "limits",
-    "assess",
-    "seed",
-    "width",
-    "launch",
-    "store",
-    "executor",
-)
+KNOWN = (*TRIAL_SECTIONS, "width", "launch", "store", "executor")
 """Top-level keys that a launch reads, beside Hydra's own."""
 
 _NOT_SETTABLE = ("hydra", "name", TARGET)
@@ -496,7 +470,7 @@ def check_launch(launch: Mapping[str, object]) -> None:
     executor = launch["executor"]
     name = executor.get("name") if isinstance(executor, Mapping) else None
     _check("launch", launch["launch"], content_of(CONFIGURATION / "config.yaml").get("launch"))
-    _check("store", launch["store"], dict.fromkeys(("url", "folder", "every")))
+    _check("store", launch["store"], {"url": None})
     _check("executor", executor, content_of(CONFIGURATION / "executor" / f"{name}.yaml"))
 
 

@@ -20,12 +20,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import import_module
-from typing import Protocol, Self
+from typing import Self
 
 from dopt.errors import UnusableEnvironmentError, unknown_name
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import LaunchSettings
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 
@@ -208,27 +208,9 @@ def _checked(result: object) -> TrialResult:
 
 EXECUTORS: Mapping[str, str] = {
     "inprocess": __name__,
-    **{name: f"orchestrate.executors.{name}" for name in ("local", "lockstep", "ray", "slurm")},
+    **{name: f"orchestrate.executors.{name}" for name in ("local", "lockstep", "ray")},
 }
 """Module of each executor in ``conf/executor/``, imported when a launch names it."""
-
-
-class Job(Protocol):
-    """Job of a batch system, in which workers take the trials from the database."""
-
-    def text(self, trials: int) -> str:
-        """Return the script that is submitted for a grid with so many trials to run."""
-        ...
-
-    def submit(self, trials: int, environment: Mapping[str, str]) -> str:
-        """Submit the job, whose workers get the variables, and return a sentence about it.
-
-        Raises
-        ------
-        LaunchError, InfrastructureError
-            If the batch system refuses the job, or cannot be reached.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -239,8 +221,7 @@ class ExecutorFactory:
     ----------
     make
         Returns the executor for the settings, not yet started. The last argument has been called
-        on this machine; machines of a cluster call it before their first trial. None where a job
-        runs the trials.
+        on this machine; machines of a cluster call it before their first trial.
     trials_at_once
         Number of trials that hold memory of this machine at the same time; None where they use
         other memory.
@@ -252,17 +233,14 @@ class ExecutorFactory:
         Whether trials run in the process of the launch; a single trial then uses this executor.
     limiting_key
         Key that reduces ``trials_at_once``.
-    job
-        Returns the job that runs the grid after the launch has left, or raises ``LaunchError``.
     """
 
-    make: Callable[[LaunchSettings, Run, Prepare | None], Executor] | None
+    make: Callable[[LaunchSettings, Run, Prepare | None], Executor]
     trials_at_once: Callable[[LaunchSettings], int | None]
     check: Callable[[LaunchSettings], None] = lambda _: None
     path: str = "kernel"
     in_process: bool = False
     limiting_key: str = "launch.workers"
-    job: Callable[[LaunchSettings], Job] | None = None
 
 
 def limits_of(settings: LaunchSettings) -> Limits:
@@ -286,21 +264,7 @@ def executor_factory(settings: LaunchSettings) -> ExecutorFactory:
 
 def make_executor(settings: LaunchSettings, run: Run, prepare: Prepare | None = None) -> Executor:
     """Return the executor that the settings name, not yet started."""
-    make = executor_factory(settings).make
-    assert make is not None, f"a job runs the trials of executor={settings.executor}"
-    return make(settings, run, prepare)
-
-
-def make_job(settings: LaunchSettings) -> Job | None:
-    """Return the job that a launch submits before it leaves, or None where it submits none.
-
-    Raises
-    ------
-    LaunchError
-        For wrong settings of the job.
-    """
-    make = executor_factory(settings).job
-    return None if make is None or settings.detach else make(settings)
+    return executor_factory(settings).make(settings, run, prepare)
 
 
 class QueueExecutor(Executor):

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from dopt.result import TrialResult
-from orchestrate.config.launch_settings import LaunchSettings, count, text
+from orchestrate.config import LaunchSettings, count, text
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import (
     Event,

@@ -327,6 +327,10 @@ def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> 
     """
     commit = commit_of(root)
     difference = _difference(root) if commit else None
+    versions = {"python": platform.python_version(), "dopt": __version__}
+    for name in LIBRARIES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
     return LaunchRecord(
         argv=[without_password_in_word(word) for word in argv],
         overrides=[without_password_in_word(word) for word in overrides],
@@ -335,7 +339,7 @@ def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> 
         git_commit=commit or os.environ.get(COMMIT_VARIABLE) or None,
         git_dirty=bool(difference) if commit else None,
         git_diff_hash=hashlib.sha256(difference).hexdigest() if difference else None,
-        versions={**_versions(), **_processor()},
+        versions={**versions, **_processor()},
         fingerprint=fingerprint(),
     )
 
@@ -361,14 +365,6 @@ def _content(root: Path, name: bytes) -> bytes:
         return hashlib.sha256(path.read_bytes()).digest()
     except OSError:
         return b"unreadable"
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version(), "dopt": __version__}
-    for name in LIBRARIES:
-        with suppress(metadata.PackageNotFoundError):
-            versions[name] = metadata.version(name)
-    return versions
 
 
 def _processor() -> dict[str, str]:

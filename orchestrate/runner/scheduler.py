@@ -30,8 +30,7 @@ from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost, executor_factory
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
@@ -419,15 +418,14 @@ class Scheduler:
             self.owned_by_others += len(tasks) - len(held)
             mine = [task for task in tasks if task.key in held]
             self._running |= {task.key: (held[task.key], task.spec) for task in mine}
+            more = self.retry_memory or 1.0
             self.executor.submit(
-                [self._sized(task) for task in mine if not self._give_up(task.key)]
+                [
+                    replace(task, memory_factor=more) if task.key in self._out_of_memory else task
+                    for task in mine
+                    if not self._give_up(task.key)
+                ]
             )
-
-    def _sized(self, task: Task) -> Task:
-        """Return the task with more memory if it has run out of memory here."""
-        if self.retry_memory is None or task.key not in self._out_of_memory:
-            return task
-        return replace(task, memory_factor=self.retry_memory)
 
     def _commit(self, events: Sequence[TaskDone]) -> None:
         results: list[tuple[Claim, TrialResult, RunRecord]] = []
@@ -480,7 +478,9 @@ class Scheduler:
     def _fail(self, claim: Claim, failure: Failure, run: RunRecord) -> None:
         if self.store.fail(claim, failure, run):
             self.tally.failed += 1
-            self.failures[_summary(failure)] += 1
+            first = next(iter(failure.message.splitlines()), "")
+            timeout = failure.cause == "timeout"
+            self.failures[first if timeout else f"{failure.type}: {first}"] += 1
         else:
             self._refuse(1)
 
@@ -534,12 +534,6 @@ def _loss_failure(lost: WorkerLost, times: int) -> Failure:
     message = f"{lost_part} {often} while running{only} this trial (last: {lost.reason})"
     cause = NODE_LOST if lost.node_lost else lost.cause
     return Failure("WorkerLost", message, lost.traceback, cause)
-
-
-def _summary(failure: Failure) -> str:
-    """Return the type and the first line of a failure."""
-    first = next(iter(failure.message.splitlines()), "")
-    return first if failure.cause == "timeout" else f"{failure.type}: {first}"
 
 
 def _on_this_clock(run: RunRecord) -> RunRecord:

@@ -1,7 +1,7 @@
 """Start of a launch: its checks, and its grid, its single trial or its preview.
 
-A grid is registered and runs in stages; a share of one is copied on the way. A single trial runs in
-this process, and ``launch.dry_run=true`` shows the preview.
+A grid is registered and runs in stages. A single trial runs in this process, and
+``launch.dry_run=true`` shows the preview.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from dopt.kernel import compiling, kinds_of
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig, labels
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid, build_grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings, build_grid
 from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.executors.base import Executor, Job, Run, executor_factory, make_executor, make_job
+from orchestrate.executors.base import Executor, Run, executor_factory, make_executor
 from orchestrate.program import ROOT, answered, exit_code, say, tell
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
 from orchestrate.runner.saving import Heartbeat, RetryingStore, launch_record
@@ -36,19 +35,15 @@ from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memo
 from orchestrate.store import (
     FINISHED,
     RETRIED,
-    URL_VARIABLE,
-    DatabaseMovedError,
     LaunchRecord,
     NoDatabaseError,
     Reader,
     Registration,
     SchemaVersionError,
     Store,
-    StoreError,
     StoreUnavailableError,
     TrialRow,
 )
-from orchestrate.store.maintenance import collect, merge_collected
 
 if TYPE_CHECKING:
     from orchestrate.config.command_line import Request  # which loads Hydra
@@ -126,11 +121,14 @@ def launch_grid(
     output = Output(say, warn or say, stream)
     if not settings.detach:
         executor_factory(settings).check(settings)
-    job = make_job(settings)
 
     def body(store: RetryingStore) -> ExitCode:
-        if settings.detach or job is not None:
-            return leave(store, grid, settings, job, say)
+        if settings.detach:
+            free_trials(store, grid, settings)
+            state = store.register(grid.trials)
+            counts = f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
+            say(f"{counts}; start workers with {WORKER} --db {store.safe_url}")
+            return ExitCode.DONE
         return _run(store, grid, settings, work, output)
 
     return recorded_launch(settings, record, output, body)
@@ -149,8 +147,7 @@ def recorded_launch(
     StoreError, InfrastructureError
         If the database or the workers fail; claims are released if that is possible.
     """
-    opened = Store.open(settings.store_url, settings.lease, settings.patience)
-    with collected(settings, output.warn), opened as store:
+    with Store.open(settings.store_url, settings.lease, settings.patience) as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):
@@ -309,25 +306,6 @@ def _count(tally: Tally, state: Registration) -> None:
 WORKER = "python -m orchestrate work"
 
 
-def leave(
-    store: RetryingStore,
-    grid: Grid,
-    settings: LaunchSettings,
-    job: Job | None,
-    say: Say,
-) -> ExitCode:
-    """Register the grid for workers, and submit the job in which they run."""
-    free_trials(store, grid, settings)
-    state = store.register(grid.trials)
-    if job is None:
-        say(f"{registered(grid, state)}; start workers with {WORKER} --db {store.safe_url}")
-        return ExitCode.DONE
-    say(f"{registered(grid, state)} · {store.safe_url}")
-    if state.todo:
-        say(job.submit(len(state.todo), {URL_VARIABLE: settings.store_url}))
-    return ExitCode.DONE
-
-
 def free_trials(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> None:
     """Put the trials of dead launches, and those to be run again, back to pending."""
     store.recover()
@@ -335,67 +313,8 @@ def free_trials(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> N
         store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
 
 
-REST = 20.0
-"""Least time between two copies, as a multiple of the time that a copy takes."""
-
-
-@contextmanager
-def collected(settings: LaunchSettings, warn: Say) -> Iterator[None]:
-    """Copy the database of the block every ``collect_seconds`` or less often, and once after it.
-
-    What earlier launches of the share have collected, perhaps on machines that are gone, is merged
-    before the block. Without a folder nothing is copied.
-
-    Raises
-    ------
-    StoreError
-        If what was collected cannot be merged, or the last copy fails; the local database is kept.
-    """
-    if settings.collect_in is None:
-        yield
-        return
-    folder, ended = settings.collect_in, threading.Event()
-    earlier = f"*.{settings.share}.*.db"
-    if any(folder.glob(earlier)):
-        for _ in merge_collected(settings.store_url, folder, earlier):
-            pass
-
-    def copy_regularly() -> None:
-        pause = settings.collect_seconds
-        while not ended.wait(pause):
-            start = time.monotonic()
-            try:
-                collect(settings.store_url, folder)
-            except StoreError as error:
-                warn(f"the results are not copied yet: {error}")
-            pause = max(settings.collect_seconds, REST * (time.monotonic() - start))
-
-    thread = threading.Thread(target=copy_regularly, name="collect", daemon=True)
-    thread.start()
-    try:
-        yield
-    except BaseException as error:
-        _stop(thread, ended)
-        if not isinstance(error, DatabaseMovedError):  # another database may have its name
-            with suppress(StoreError):  # the first error is the one to report
-                collect(settings.store_url, folder)
-        raise
-    _stop(thread, ended)
-    collect(settings.store_url, folder)
-
-
-def _stop(thread: threading.Thread, ended: threading.Event) -> None:
-    ended.set()
-    thread.join()
-
-
 MAX_LISTED_CAUSES = 3
 """Causes of failure that the summary lists."""
-
-
-def registered(grid: Grid, state: Registration) -> str:
-    """Return the counts of a grid that was registered for workers."""
-    return f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
 
 
 def _counts(grid: Grid, state: Registration, running: str, heading: str = "") -> str:
@@ -461,8 +380,6 @@ def checked(request: Request) -> tuple[Grid, LaunchSettings]:
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)
-    if settings.share:
-        grid = grid.only(settings.share.holds)
     if not settings.detach:  # workers may run on other machines
         if any(trial.config.path == "kernel" for trial in grid.trials):
             cache.check_environment()
@@ -478,29 +395,16 @@ def _check_kind(settings: LaunchSettings, *, single: bool) -> None:
             "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
             "-m and a range such as 'seed=range(100)', or leave launch.until out."
         )
-    leaving = _leaving(settings)
-    if single and (leaving or settings.share):
-        key = leaving or "launch.share"
+    if settings.detach and single:
         raise LaunchError(
-            f"{key} is for grids, but a single trial is asked for: add -m, or leave {key} out."
+            "launch.detach is for grids, but a single trial is asked for: add -m, or leave "
+            "launch.detach out."
         )
-    if settings.share and (leaving or settings.until):
+    if settings.detach and settings.until:
         raise LaunchError(
-            f"{leaving or 'launch.until'} needs the whole grid in one database, but launch.share "
-            "takes a part of it: leave one of the two out."
-        )
-    if leaving and settings.until:
-        raise LaunchError(
-            f"launch.until looks at results before it asks for more seeds, but {leaving} leaves "
+            "launch.until looks at results before it asks for more seeds, but launch.detach leaves "
             "before there are any: leave one of the two out."
         )
-
-
-def _leaving(settings: LaunchSettings) -> str:
-    """Return the setting by which a launch leaves its grid to workers; empty without one."""
-    if settings.detach:
-        return "launch.detach"
-    return f"executor={settings.executor}" if make_job(settings) else ""
 
 
 @answered
@@ -512,8 +416,6 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
         say(preview(grid, settings.store_url, settings.retry))
         if settings.until:
             say("launch.until may need fewer of these seeds: they are run in batches")
-        if job := make_job(settings):
-            say(job.text(len(grid.trials)))
         return ExitCode.DONE
     record = launch_record(sys.argv, request.overrides, ROOT)
     if not request.single:
@@ -521,6 +423,9 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
     code, line = launch_trial(grid.trials[0], settings, record, WORK)
     say(line)
     return code
+
+
+_TRACEBACK = "SELECT traceback FROM v_failures WHERE trial_key = :key ORDER BY attempt DESC LIMIT 1"
 
 
 def launch_trial(
@@ -547,9 +452,13 @@ def launch_trial(
         if row is None:  # interrupted before it was registered
             return code, f"{_name(trial)} · not started · {reader.safe_url}"
         if row.status == "failed":
-            tell(sys.stderr, _traceback(reader, trial))
-        was_done = row.attempt == before and row.status != "pending"
-        outcome = f"{_already_run(row)} · {_outcome(row)}" if was_done else _outcome(row)
+            found = reader.rows(_TRACEBACK, key=trial.trial_key)
+            tell(sys.stderr, str(found[0][0]) if found else "")
+        outcome = _outcome(row)
+        if row.attempt == before and row.status == "done":
+            outcome = f"already done, nothing to run · {outcome}"
+        elif row.attempt == before and row.status != "pending":
+            outcome = f"already run (launch.retry={row.status} runs it again) · {outcome}"
         return code, f"{_name(trial)} · {outcome} · {reader.safe_url}"
 
 
@@ -574,12 +483,6 @@ def _name(trial: TrialSpec) -> str:
     return " ".join([*words, f"seed={trial.seed}"])
 
 
-def _already_run(row: TrialRow) -> str:
-    if row.status == "done":
-        return "already done, nothing to run"
-    return f"already run (launch.retry={row.status} runs it again)"
-
-
 def _outcome(row: TrialRow) -> str:
     if row.status == "failed":
         return f"failed with {row.error_type}: {row.error_message}"
@@ -591,16 +494,8 @@ def _outcome(row: TrialRow) -> str:
     return f"final loss {row.final_loss:.4g} · best {row.best_loss:.4g} · {steps}"
 
 
-def _traceback(reader: Reader, trial: TrialSpec) -> str:
-    """Return the traceback of the last failure."""
-    rows = reader.rows(
-        "SELECT traceback FROM v_failures WHERE trial_key = :key ORDER BY attempt DESC LIMIT 1",
-        key=trial.trial_key,
-    )
-    return str(rows[0][0]) if rows else ""
-
-
 COUNTS = ("trials", "done", "failed", "to run")
+_COUNTED = {**dict.fromkeys(FINISHED, "done"), "failed": "failed", "cancelled": "failed"}
 
 
 def preview(grid: Grid, url: str, retry: str | None = None) -> str:
@@ -615,7 +510,7 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
         row = rows.setdefault(trial.config_key, Counter())
         row["trials"] += 1
         found = status.get(trial.trial_key)
-        row["to run" if found in again else _heading(found)] += 1
+        row["to run" if found in again else _COUNTED.get(found or "", "to run")] += 1
     configs = list({trial.config_key: trial for trial in grid.trials}.values())
     lines = [["env", "configuration", *COUNTS]]
     for trial, label in zip(configs, _labels(configs), strict=True):
@@ -645,9 +540,3 @@ def _statuses(url: str) -> dict[str, str]:
         return {}
     with reader:
         return dict(map(tuple, reader.rows("SELECT trial_key, status FROM trial")))
-
-
-def _heading(status: str | None) -> str:
-    if status in FINISHED:
-        return "done"
-    return "failed" if status in ("failed", "cancelled") else "to run"

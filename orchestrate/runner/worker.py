@@ -19,7 +19,7 @@ from dopt.errors import DoptError
 from dopt.process import usable_cores
 from dopt.spec.config import TrialConfig, completed
 from dopt.spec.trial import TrialSpec, stored_trial
-from orchestrate.config.launch_settings import LaunchSettings, factor
+from orchestrate.config import LaunchSettings, factor
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task
 from orchestrate.fingerprint import differences, fingerprint
@@ -99,7 +99,7 @@ def run_worker(
     processes
         Trials at once; None for one on each core that this process may use.
     timeout, memory_gib, retry_memory, lease
-        As in :class:`orchestrate.config.launch_settings.LaunchSettings`.
+        As in :class:`orchestrate.config.LaunchSettings`.
 
     Raises
     ------

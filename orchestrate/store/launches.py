@@ -7,9 +7,8 @@ another launch finds that its process is gone.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import (
@@ -27,7 +26,7 @@ from sqlalchemy import (
 
 from orchestrate.errors import LaunchAliveError
 from orchestrate.store import schema
-from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
+from orchestrate.store.backend import Backend, LaunchLife, NewTrial
 from orchestrate.store.records import (
     Claim,
     LaunchRecord,
@@ -460,15 +459,12 @@ class GridRows:
         self.trials: dict[str, tuple[str, int]] = {}  # trial_key -> config_key, seed
         self.configs: dict[str, dict[str, Any]] = {}
         for spec in specs:
-            self._add(spec)
-
-    def _add(self, spec: TrialSpec | MarkedTrial) -> None:
-        config_key = spec.config_key
-        known = self.configs.get(config_key)
-        if known is None:
-            known = self.configs[config_key] = _config_row(spec)
-        # The string of the row is shared by all trials of the configuration.
-        self.trials.setdefault(spec.trial_key, (known["config_key"], int(plain(spec.seed))))
+            config_key = spec.config_key
+            known = self.configs.get(config_key)
+            if known is None:
+                known = self.configs[config_key] = _config_row(spec)
+            # The string of the row is shared by all trials of the configuration.
+            self.trials.setdefault(spec.trial_key, (known["config_key"], int(plain(spec.seed))))
 
 
 def _config_row(spec: TrialSpec | MarkedTrial) -> dict[str, Any]:
@@ -498,10 +494,13 @@ def register(
         connection.execute(insert(config), added)
     config_ids = _config_ids(connection, backend, list(grid.configs)) if added else before
     found: dict[str, tuple[str, int | None]] = {}
-    for keys in _chunks(grid.trials):
+    every, columns = list(grid.trials), (trial.c.trial_key, trial.c.status, trial.c.owner)
+    for start in range(0, len(every), _BATCH_ROWS):
+        keys = every[start : start + _BATCH_ROWS]
         # A configuration that was not there has no trials.
-        old = [key for key in keys if grid.trials[key][0] in before]
-        known = _known_trials(connection, backend, old) if old else {}
+        old = backend.members([key for key in keys if grid.trials[key][0] in before])
+        rows = connection.execute(select(*columns).where(trial.c.trial_key.in_(old)))
+        known = {key: (status, owner) for key, status, owner in rows}
         _take_over(connection, backend, launch_id, list(known))
         places = ((key, *grid.trials[key]) for key in keys if key not in known)
         trials = [NewTrial(key, config_ids[config_key], seed) for key, config_key, seed in places]
@@ -516,15 +515,6 @@ def _config_ids(connection: Connection, backend: Backend, keys: Sequence[str]) -
         config.c.config_key.in_(backend.members(keys))
     )
     return {row[0]: row[1] for row in connection.execute(statement)}
-
-
-def _known_trials(
-    connection: Connection, backend: Backend, keys: Sequence[str]
-) -> dict[str, tuple[str, int | None]]:
-    statement = select(trial.c.trial_key, trial.c.status, trial.c.owner).where(
-        trial.c.trial_key.in_(backend.members(keys))
-    )
-    return {key: (status, owner) for key, status, owner in connection.execute(statement)}
 
 
 def _take_over(
@@ -557,9 +547,3 @@ def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Reg
         else:
             todo.append(key)
     return Registration(total=len(found), **counts, running_elsewhere=elsewhere, todo=todo)
-
-
-def _chunks(keys: Iterable[str]) -> Iterator[list[str]]:
-    iterator = iter(keys)
-    while chunk := list(islice(iterator, _BATCH_ROWS)):
-        yield chunk

@@ -1,4 +1,4 @@
-"""Maintenance of databases: backup, upgrade, shared copies, what can be pruned, and examination.
+"""Maintenance of databases: backup, upgrade, what can be pruned, and examination.
 
 In an upgrade the check for running launches, the backup, the migration and the labels of
 configurations are one exclusive transaction. The statements of a schema never change; what the
@@ -11,38 +11,31 @@ results of different code, and claims of dead launches.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from sqlalchemy import URL, Connection, bindparam, select, text, update
+from sqlalchemy import Connection, bindparam, select, text, update
 
 from dopt.spec.config import REGISTRIES, config_label, section_class
 from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
 from orchestrate.files import whole
-from orchestrate.store import launches, records, schema
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.base import (
+from orchestrate.store import launches, records, schema, sqlite
+from orchestrate.store.backend import (
     Backend,
     copy_checked,
     dump,
     parse_url,
     public_url,
-    sqlite_path,
     translated,
     translated_file,
 )
 from orchestrate.store.merge import Merged, merge
 from orchestrate.store.reader import Reader
-from orchestrate.store.records import TrialKey
 from orchestrate.store.schema import (
     ENDED,
     N_ROWS,
@@ -70,65 +63,34 @@ def back_up(url: str, target: Path) -> int:
     """
     if target.exists():
         raise StoreError(f"The file {target} exists, a new one is expected: give another name.")
+    parsed = parse_url(url)
     with whole(target, "FILE") as partial:
-        _copy(parse_url(url), url, partial)
+        if parsed.get_backend_name() == "postgresql":
+            with Reader.open(url) as reader:
+                ((schema,),) = reader.rows("SELECT quote_ident(current_schema())")
+            dump(parsed, schema, partial)
+        else:
+            with translated(public_url(parsed), opening=True):
+                copy_checked(sqlite.existing_path(parsed), partial)
     return target.stat().st_size
 
 
-def _copy(parsed: URL, url: str, partial: Path) -> None:
-    if parsed.get_backend_name() == "postgresql":
-        with Reader.open(url) as reader:
-            ((schema,),) = reader.rows("SELECT quote_ident(current_schema())")
-        dump(parsed, schema, partial)
-        return
-    with translated(public_url(parsed), opening=True):
-        copy_checked(sqlite.existing_path(parsed), partial)
-
-
-def collect(url: str, folder: Path) -> None:
-    """Copy a SQLite database, which launches may be writing, to a file of its name in a folder.
-
-    Raises ``StoreUnavailableError`` if the folder has no room or fails, and ``StoreError`` if it
-    can never be written; an older copy stays then.
-    """
-    path = sqlite_path(parse_url(url))
-    partial = folder / f"{path.name}.{os.getpid()}.partial"
-    with (
-        translated_file(str(folder)),
-        translated(url),
-        tempfile.TemporaryDirectory(dir=path.parent) as local,
-    ):
-        copy = Path(local) / path.name
-        copy_checked(path, copy)
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            shutil.copyfile(copy, partial)
-            with partial.open("rb") as written:
-                os.fsync(written.fileno())
-            partial.replace(folder / path.name)
-        finally:
-            partial.unlink(missing_ok=True)
-
-
-def merge_collected(
-    url: str, folder: Path, pattern: str = "*.db", trial_key: TrialKey | None = None
-) -> Iterator[Merged]:
-    """Merge the copies in a folder into a database, one after the other.
+def merge_folder(url: str, folder: Path) -> Merged:
+    """Merge the SQLite files in a folder into a database, one after the other.
 
     Raises ``NoDatabaseError`` if it holds none, and as :func:`merge` does.
     """
-    found = sorted(folder.glob(pattern))
+    found = sorted(folder.glob("*.db"))
     if not found:
-        raise NoDatabaseError(
-            f"The folder {folder} holds no database ({pattern}): give one that launches with "
-            "store=shards have written to."
-        )
+        raise NoDatabaseError(f"The folder {folder} holds no database (*.db): give another one.")
+    total = Merged()
     for path in found:
         with tempfile.TemporaryDirectory() as local:
             copy = Path(local) / path.name
             with translated_file(str(path)):
                 shutil.copyfile(path, copy)
-            yield merge(url, f"sqlite:///{copy}", trial_key)
+            total.include(merge(url, f"sqlite:///{copy}"))
+    return total
 
 
 _TRIALS = f"""
@@ -316,7 +278,6 @@ def migrate(connection: Connection, version: int) -> None:
 
 
 Severity = Literal["error", "note"]
-_ORDER = ("error", "note")
 
 _MAX_REPORTED = 20
 
@@ -360,59 +321,29 @@ class Finding:
     advice: str
 
 
-def examine(url: str, trial_key: TrialKey | None = None) -> list[Finding]:
+def examine(url: str) -> list[Finding]:
     """Return the findings of all checks, errors first; nothing is written.
 
-    Parameters
-    ----------
-    url
-        SQLite or PostgreSQL. A changed bit within a number of a SQLite file cannot be detected.
-    trial_key
-        Computes the key of a trial from the JSON of its configuration and its seed; without it the
-        keys of trials are not checked.
-
-    Raises
-    ------
-    StoreError
-        As :meth:`Reader.open` does; damage to a file that can still be opened is a finding.
+    A changed bit within a number of a SQLite file cannot be detected. Raises ``StoreError`` as
+    :meth:`Reader.open` does; damage to a file that can still be opened is a finding.
     """
     parsed = parse_url(url)
     is_file = parsed.get_backend_name() == "sqlite"
     findings: list[Finding] = []
     try:
         with Reader.open(url) as reader, reader.moment() as moment:
-            for check in _checks(moment, is_file, trial_key):
-                with _damage_recorded(findings, is_file):
-                    findings += check()
+            for check in (*(_OF_FILES if is_file else ()), *_CHECKS):
+                try:
+                    findings += check(moment)
+                except StoreUnavailableError as error:  # of a damaged page, or of a server
+                    if not is_file or error.transient:
+                        raise
+                    findings.append(Finding("error", str(error).rstrip("."), 1, _RESTORE))
     except StoreUnavailableError:
         # After damage SQLite may not even end the transaction; the findings are kept.
         if not any(one.severity == "error" for one in findings):
             raise
-    return sorted(dict.fromkeys(findings), key=lambda one: _ORDER.index(one.severity))
-
-
-def _checks(
-    moment: Reader, is_file: bool, trial_key: TrialKey | None
-) -> Iterator[Callable[[], list[Finding]]]:
-    if is_file:
-        yield partial(_damaged_pages, moment)
-        yield partial(_dangling_references, moment)
-    yield partial(_incomplete_results, moment)
-    yield partial(_damaged_curves, moment)
-    yield partial(_wrong_keys, moment, trial_key)
-    yield partial(_mixed_code, moment)
-    yield partial(_dead_launches, moment)
-
-
-@contextmanager
-def _damage_recorded(findings: list[Finding], is_file: bool) -> Iterator[None]:
-    """Record a damaged page as a finding; the error of a server ends the examination."""
-    try:
-        yield
-    except StoreUnavailableError as error:
-        if not is_file or error.transient:
-            raise
-        findings.append(Finding("error", str(error).rstrip("."), 1, _RESTORE))
+    return sorted(dict.fromkeys(findings), key=lambda one: one.severity)
 
 
 def _several(severity: Severity, what: str, names: Sequence[object], advice: str) -> list[Finding]:
@@ -454,34 +385,28 @@ def _damaged_curves(moment: Reader) -> list[Finding]:
     return _several("error", "trials with a packed curve that is damaged", damaged, _PACK_AGAIN)
 
 
-def _wrong_keys(moment: Reader, trial_key: TrialKey | None) -> list[Finding]:
-    """Compare every key with a new hash; keys of trials only if ``trial_key`` is given."""
+def _wrong_keys(moment: Reader) -> list[Finding]:
+    """Compare every key with a new hash."""
     rows = moment.rows("SELECT config_id, config_key, config_json FROM config ORDER BY config_id")
     texts = {config_id: text for config_id, _, text in rows}
-    wrong = [key for _, key, text in rows if hashlib.sha256(text.encode()).hexdigest() != key]
-    findings = _several("error", f"configurations {_MISMATCH}", [*map(_brief, wrong)], _RUN_AGAIN)
-    if trial_key is None:
-        return findings
+    wrong = [key[:12] for _, key, text in rows if records.config_key(text) != key]
+    findings = _several("error", f"configurations {_MISMATCH}", wrong, _RUN_AGAIN)
     trials = moment.batches(
         10_000, "SELECT config_id, seed, trial_key FROM trial ORDER BY trial_id"
     )
     wrong = [
-        key
+        key[:12]
         for batch in trials
         for config_id, seed, key in batch
-        if trial_key(texts[config_id], seed) != key
+        if records.trial_key(texts[config_id], seed) != key
     ]
-    return findings + _several("error", f"trials {_MISMATCH}", [*map(_brief, wrong)], _RUN_AGAIN)
-
-
-def _brief(key: str) -> str:
-    return key[:12]
+    return findings + _several("error", f"trials {_MISMATCH}", wrong, _RUN_AGAIN)
 
 
 def _mixed_code(moment: Reader) -> list[Finding]:
     """Find the configurations whose finished trials were run by different code."""
     what = "configurations with results of code or libraries with different fingerprints"
-    return _several("note", what, [*map(_brief, moment.mixed_code())], _ONE_CODE)
+    return _several("note", what, [key[:12] for key in moment.mixed_code()], _ONE_CODE)
 
 
 def _dead_launches(moment: Reader) -> list[Finding]:
@@ -579,3 +504,7 @@ def _incomplete_results(moment: Reader) -> list[Finding]:
         names = [row[1] for row in rows if row[column]]
         findings += _several("error", condition, names, _REBUILD)
     return findings
+
+
+_OF_FILES = (_damaged_pages, _dangling_references)
+_CHECKS = (_incomplete_results, _damaged_curves, _wrong_keys, _mixed_code, _dead_launches)

@@ -7,7 +7,6 @@ that was killed can be repeated, and repeating a finished merge changes nothing.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,11 +20,10 @@ import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from orchestrate.errors import StoreError
-from orchestrate.store import records
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.base import Backend, parse_url, public_url, sqlite_path
+from orchestrate.store import records, sqlite
+from orchestrate.store.backend import Backend, parse_url, public_url, sqlite_path
 from orchestrate.store.reader import Reader
-from orchestrate.store.records import DTYPE, Array, TrialKey, stored_json, unpack
+from orchestrate.store.records import DTYPE, Array, stored_json, unpack
 from orchestrate.store.schema import (
     FINISHED,
     N_ROWS,
@@ -127,10 +125,10 @@ class Candidate:
 
 
 class Source:
-    """Queries to a snapshot of the source database; ``trial_key`` is as in :func:`merge`."""
+    """Queries to a snapshot of the source database."""
 
-    def __init__(self, moment: Reader, trial_key: TrialKey | None = None) -> None:
-        self._moment, self._trial_key = moment, trial_key
+    def __init__(self, moment: Reader) -> None:
+        self._moment = moment
         self._texts: dict[int, str] = {}  # JSON of configurations, empty for another than its key
         self._expected = dict(map(tuple, moment.rows(_EXPECTED)))
 
@@ -141,7 +139,9 @@ class Source:
     def pages(self) -> Iterator[list[Candidate]]:
         """Yield the trials that have an outcome, as many at once as one transaction takes."""
         last = 0
-        while rows := _first(self._dicts(_TRIALS, last=last, size=PAGE)):
+        while rows := self._dicts(_TRIALS, last=last, size=PAGE):
+            steps = accumulate(row["n_rows"] or 0 for row in rows)
+            rows = rows[: max(sum(n <= PAGE_STEPS for n in steps), 1)]
             last = rows[-1]["trial_id"]
             yield self._candidates(rows, {"first": rows[0]["trial_id"], "last": last})
 
@@ -189,13 +189,12 @@ class Source:
         """Return whether keys are hashes of what is stored: no specification is built of it."""
         if (config_id := row["config_id"]) not in self._texts:
             text = self.config(config_id)["config_json"]
-            same = hashlib.sha256(text.encode()).hexdigest() == row["config_key"]
+            same = records.config_key(text) == row["config_key"]
             with suppress(StoreError):
                 stored_json(text, dict)
                 self._texts[config_id] = text if same else ""
         text = self._texts.get(config_id, "")
-        key = self._trial_key(text, row["seed"]) if self._trial_key else row["trial_key"]
-        return bool(text) and key == row["trial_key"]
+        return bool(text) and records.trial_key(text, row["seed"]) == row["trial_key"]
 
     def config(self, config_id: int) -> dict[str, Any]:
         (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
@@ -225,13 +224,6 @@ def _agree(row: Mapping[str, Any], curve: Curve | None) -> bool:
     same = all(packed[f"{names[i]}_shape"] == json.dumps(arrays[i].shape) for i in range(3))
     fits = row["grows"] or row["n_rows"] == steps
     return bool(same and fits and sizes == (2, 2, 1, steps + 1, DTYPE))
-
-
-def _first(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the trials that fit into one transaction by their steps, and at least one."""
-    steps = accumulate(row["n_rows"] or 0 for row in trials)
-    fitting = sum(n <= PAGE_STEPS for n in steps)
-    return trials[: max(fitting, 1)]
 
 
 def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]]]:
@@ -499,18 +491,17 @@ class Merged:
         return bool(self.added or self.launches)
 
 
-def merge(url: str, other_url: str, trial_key: TrialKey | None = None) -> Merged:
+def merge(url: str, other_url: str) -> Merged:
     """Bring the trials with an outcome of ``other_url`` into ``url``, and what belongs to them.
 
     Either may be SQLite or PostgreSQL; the first is created where nothing is, the other is only
-    read. ``trial_key`` is as in :func:`orchestrate.store.examine`. Raises ``StoreError`` as the
-    opening of a store and of a reader do.
+    read. Raises ``StoreError`` as the opening of a store and of a reader do.
     """
     _refuse_itself(url, other_url)
     merged = Merged()
     with Reader.open(other_url) as reader, reader.moment() as moment, Store.open(url) as store:
         store.recover()
-        source = Source(moment, trial_key)
+        source = Source(moment)
         with store._backend.transaction() as connection:
             store._backend.exclusive(connection)
             launches, merged.launches = add_launches(connection, source.launches())

@@ -27,9 +27,8 @@ from sqlalchemy.exc import DBAPIError
 
 from dopt.errors import suggestion
 from orchestrate.errors import QueryError
-from orchestrate.store import query_process, schema
-from orchestrate.store.backends import postgresql, sqlite
-from orchestrate.store.backends.base import (
+from orchestrate.store import postgresql, query_process, schema, sqlite
+from orchestrate.store.backend import (
     LaunchLife,
     is_of_driver,
     out_of_time,
@@ -66,36 +65,6 @@ RESULT_BYTES = 50_000_000
 
 _PAUSE_MILLISECONDS = 100
 _COMMAND = (sys.executable, "-I", "-S", query_process.__file__)
-
-
-def run_select(
-    request: Request,
-    safe_url: str,
-    sql: str,
-    limit: int | None = None,
-    timeout: float | None = None,
-    stopped: Callable[[], bool] = lambda: False,
-) -> Table:
-    """Return the first ``limit`` rows of the statement.
-
-    ``request`` says how the driver connects. The process is killed after ``timeout`` seconds, when
-    its answer is too large, when ``stopped`` says so, and with this process.
-    """
-    given = {"sql": sql, "seconds": timeout, "limit": None if limit is None else limit + 1}
-    request = {**request, **given, "path": [folder for folder in sys.path if folder]}
-    with translated_query(safe_url, timeout):
-        with _process(request) as process:
-            answer = _read(process, timeout, stopped)
-        parts = [None, *_unpickled(answer)]
-        end = parts.pop()
-        if not isinstance(end, dict):
-            raise QueryError("The process of the query was killed before its end: run it again.")
-        if end["error"] is not None:
-            raise _failure(end["error"], sql, safe_url)
-    _, _, columns, *rows = parts
-    if columns is None:
-        raise QueryError("The query returns no rows: give one SELECT.")
-    return Table(columns, rows[:limit], cut=limit is not None and len(rows) > limit)
 
 
 @contextmanager
@@ -155,17 +124,6 @@ def _unpickled(answer: bytes) -> Iterator[Any]:
     with suppress(EOFError, pickle.UnpicklingError):
         while True:
             yield pickle.load(stream)
-
-
-def _failure(error: Exception, sql: str, safe_url: str) -> Exception:
-    if isinstance(error, MemoryError):
-        return QueryError(
-            f"The query needs more than {MEMORY_BYTES / 2**30:g} GiB of memory and was ended: "
-            "make it smaller."
-        )
-    if is_of_driver(error):
-        return DBAPIError(sql, None, error)
-    return QueryError(f"The query failed on {safe_url}: {error}.")
 
 
 _LAUNCHES = select(launch).order_by(launch.c.launch_id)
@@ -274,7 +232,12 @@ class Reader:
                 ConfigRow(*values, completed(stored_json(content, dict)))  # type: ignore[call-arg]
                 for *values, content in connection.execute(_CONFIGS)
             ]
-        return sorted(configs, key=_names)
+
+        def name(row: ConfigRow) -> tuple[str | int, ...]:  # databases order letters differently
+            sizes = (-1 if size is None else size for size in (row.width, row.depth))
+            return (row.env, row.policy, row.model, row.learner, *sizes, row.config_key)
+
+        return sorted(configs, key=name)
 
     def launches(self) -> list[LaunchRow]:
         """Return all launches that wrote to the database, the oldest first."""
@@ -356,12 +319,37 @@ class Reader:
 
         Only the first ``limit`` rows are read; ``cut`` of the table is True if there are more.
         The statement runs in a process and through a connection of its own, with the URL ``login``
-        where one is given, until ``stopped`` says True. Raises ``QueryError`` if the database
-        rejects the statement, such as one that writes or several in one text, or if it takes
-        longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
+        where one is given. The process is killed after ``timeout`` seconds, when its answer is too
+        large, when ``stopped`` says True, and with this process. Raises ``QueryError`` if the
+        database rejects the statement, such as one that writes or several in one text, or if it
+        takes longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
         """
-        request = self._kind.request(login or self._url)
-        return run_select(request, self.safe_url, sql, limit, timeout, stopped)
+        request: Request = {
+            **self._kind.request(login or self._url),
+            **{"sql": sql, "seconds": timeout, "limit": None if limit is None else limit + 1},
+            "path": [folder for folder in sys.path if folder],
+        }
+        with translated_query(self.safe_url, timeout):
+            with _process(request) as process:
+                parts = [None, *_unpickled(_read(process, timeout, stopped))]
+            end = parts.pop()
+            if not isinstance(end, dict):
+                raise QueryError(
+                    "The process of the query was killed before its end: run it again."
+                )
+            if isinstance(end["error"], MemoryError):
+                raise QueryError(
+                    f"The query needs more than {MEMORY_BYTES / 2**30:g} GiB of memory and was "
+                    "ended: make it smaller."
+                )
+            if end["error"] is not None and is_of_driver(end["error"]):
+                raise DBAPIError(sql, None, end["error"])
+            if end["error"] is not None:
+                raise QueryError(f"The query failed on {self.safe_url}: {end['error']}.")
+        _, _, columns, *rows = parts
+        if columns is None:
+            raise QueryError("The query returns no rows: give one SELECT.")
+        return Table(columns, rows[:limit], cut=limit is not None and len(rows) > limit)
 
     def rows(self, sql: str, /, **values: object) -> Table:
         """Return the rows of a trusted SELECT, with each ``:name`` in it bound to a value.
@@ -395,12 +383,6 @@ _KINDS = {"sqlite": sqlite, "postgresql": postgresql}
 
 def _kind(url: URL) -> ModuleType:
     return _KINDS[url.get_backend_name()]
-
-
-def _names(row: ConfigRow) -> tuple[str | int, ...]:
-    """Return the sort key; not in SQL, where databases order letters and NULL differently."""
-    sizes = (-1 if size is None else size for size in (row.width, row.depth))
-    return (row.env, row.policy, row.model, row.learner, *sizes, row.config_key)
 
 
 def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:

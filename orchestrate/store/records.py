@@ -12,11 +12,12 @@ within one.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import zlib
 from collections import namedtuple
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -39,13 +40,10 @@ from sqlalchemy import (
 )
 
 from orchestrate.errors import StoreError, StoreUnavailableError
-from orchestrate.store.backends.base import Backend
+from orchestrate.store.backend import Backend
 from orchestrate.store.schema import FINISHED, N_ROWS, STEP_VALUES, Outcome, curve, step, trial
 
 Array = npt.NDArray[np.float64]
-
-TrialKey = Callable[[str, int], str]
-"""Function from the JSON of a configuration and a seed to the key of the trial."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +104,16 @@ class Registration:
     cancelled: int
     running_elsewhere: int
     todo: list[str]
+
+
+def config_key(config_json: str) -> str:
+    """Return the key of a configuration."""
+    return hashlib.sha256(config_json.encode()).hexdigest()
+
+
+def trial_key(config_json: str, seed: int) -> str:
+    """Return the key of a trial as :class:`dopt.spec.trial.TrialSpec` makes it."""
+    return config_key(f'{config_json[:-1]},"seed":{seed}}}')
 
 
 DTYPE = "<f8"

@@ -332,12 +332,9 @@ FROM (SELECT config_key, label, env, policy, model, learner, width, depth, t,
 """
 
 
-def _count(status: str) -> str:
-    return f"count(*) FILTER (WHERE r.status = '{status}') AS n_{status}"
-
-
 _COUNTS = ",\n       ".join(
-    _count(status) for status in ("done", "diverged", "failed", "cancelled", "pending", "running")
+    f"count(*) FILTER (WHERE r.status = '{status}') AS n_{status}"
+    for status in ("done", "diverged", "failed", "cancelled", "pending", "running")
 )
 
 _PROGRESS = f"""
@@ -412,14 +409,6 @@ _COLUMNS = {
     "FROM pg_class AS c JOIN pg_attribute AS a ON a.attrelid = c.oid WHERE c.relkind = 'r' "
     "AND c.relnamespace = to_regnamespace(current_schema()) AND a.attnum > 0 AND a.atttypid > 0",
 }
-
-
-def create_or_check(connection: Connection, safe_url: str) -> None:
-    """Create the tables of an empty database; raise ``SchemaVersionError`` for another version."""
-    if is_empty(connection):
-        create(connection)
-    else:
-        check(connection, safe_url)
 
 
 def is_empty(connection: Connection) -> bool:

@@ -26,9 +26,7 @@ from sqlalchemy import (
 from orchestrate.errors import InvalidResultError, StoreError, without_password
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store import records, schema
-from orchestrate.store.backends.base import Backend, parse_url
-from orchestrate.store.backends.postgresql import PostgreSQLBackend
-from orchestrate.store.backends.sqlite import SQLiteBackend
+from orchestrate.store.backend import Backend, parse_url
 from orchestrate.store.launches import (
     GridRows,
     Launches,
@@ -37,6 +35,7 @@ from orchestrate.store.launches import (
     register,
     renew,
 )
+from orchestrate.store.postgresql import PostgreSQLBackend
 from orchestrate.store.records import (
     DTYPE,
     Array,
@@ -65,6 +64,7 @@ from orchestrate.store.schema import (
     trajectory,
     trial,
 )
+from orchestrate.store.sqlite import SQLiteBackend
 
 if TYPE_CHECKING:
     from dopt.result import Assessment, TrialResult
@@ -114,7 +114,10 @@ class Store(Launches):
         backend = make_backend(parse_url(url), lease_seconds, patience)
         try:
             with backend.creation() as connection:
-                schema.create_or_check(connection, backend.safe_url)
+                if schema.is_empty(connection):
+                    schema.create(connection)
+                else:
+                    schema.check(connection, backend.safe_url)
         except BaseException:
             backend.close()
             raise

@@ -316,15 +316,15 @@ def test_a_label_names_the_field_only_where_it_differs() -> None:
 
 
 def test_the_text_that_is_stored_is_the_one_whose_hash_is_the_key(tmp_path: Path) -> None:
-    from orchestrate.commands.maintenance import trial_key
     from orchestrate.store.maintenance import examine
+    from orchestrate.store.records import trial_key
     from tests.analysis.synthetic import fill
 
     for spec in (PLAIN, FRESH):
         assert trial_key(spec.config_json, spec.seed) == spec.trial_key
     url = f"sqlite:///{tmp_path}/results.db"
     fill(url, [PLAIN, FRESH])
-    assert examine(url, trial_key) == []
+    assert examine(url) == []
 
 
 class Heavy(Pendulum):

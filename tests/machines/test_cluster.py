@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ import pytest
 from tests.machines.hosts import Process, until
 from tests.machines.lab import Lab, Outcome, leave
 from tests.machines.witness import HOLD, PAUSE, let_go, read_notes
+from tests.paths import ROOT
 
 Measured = Callable[[str, float], None]
 
@@ -127,6 +129,21 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     outcome.check_complete(undisturbed, seeds=4)
     assert outcome.attempts_of("done")[seed][4] == "w1"
     assert len(outcome.attempts) == 4
+
+
+def test_a_host_of_other_code_is_refused_before_it_computes_anything(lab: Lab) -> None:
+    other = lab.host("w1").folder / "other"
+    for package in ("dopt", "orchestrate"):
+        ignore = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / package, other / package, symlinks=True, ignore=ignore)
+    with (other / "dopt/result.py").open("a") as source:
+        source.write("# other\n")
+    lab.start_cluster()
+    lab.add_worker("w1", PYTHONPATH=str(other))
+    launched = lab.launch(seeds=4)
+    assert launched.wait() == 75
+    assert "on node w1 the code of dopt is" in launched.output
+    assert lab.count("trial", "status = 'pending'") == 4
 
 
 def begun(lab: Lab, launched: Process, host: str) -> int:

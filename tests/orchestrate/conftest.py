@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
 from orchestrate.program import readable_streams

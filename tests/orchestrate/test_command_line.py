@@ -26,8 +26,8 @@ from orchestrate.program import SUCCESSORS
 from orchestrate.runner import start
 from orchestrate.runner.start import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
-from orchestrate.store.backends.base import parse_url
-from orchestrate.store.backends.sqlite import existing_path
+from orchestrate.store.backend import parse_url
+from orchestrate.store.sqlite import existing_path
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.pages import commands
 from tests.paths import ROOT
@@ -50,6 +50,10 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "env.gama=3,4"], "setting of env 'gama' is unknown.* did you mean 'gamma'"),
         (["evn=pendulum"], "setting 'evn' is unknown.* did you mean 'env'"),
         (["-m", "seed=range(0,0)"], "'seed=range\\(0,0\\)' has no values"),
+        (["-m", "width=glob(*)"], "is a glob, but 'width' is not a group"),
+        (["-m", "launch.workers=1,2"], "sweeps a setting of the launch"),
+        (["env=pendulum", "launch.detach=true"], "launch.detach is for grids"),
+        (["-m", "launch.detach=true", "launch.until=ci<5%"], "leaves before there are any"),
         (["width=wide"], "model.width is 'wide' .* a whole number is expected"),
         (["-m", "width=8,wide"], "model.width is 'wide' .* a whole number is expected"),
         (["env.mass=-1"], "env.mass is -1.0 kg, but it has to be finite and above 0"),
@@ -69,6 +73,13 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["width=${wdth}"], "'wdth' not found"),
         (["env=[1"], "cannot read the override 'env=\\[1'"),
         (["env=quadrotor", "policy=periodic"], "eigenmode"),
+        (["-m", "env=quadrotor", "policy=periodic"], "the grid is empty: env=quadrotor"),
+        (["executor.name=locla"], "executor.name 'locla' is unknown.* did you mean 'local'"),
+        *(
+            ([*words, f"executor.device={device}"], f"executor.device is '{device}'")
+            for words in (["executor=lockstep"], ["-m", "seed=0", "executor=lockstep"])
+            for device in ("cuda:99", "banana", "meta")
+        ),
         (["plant=real", "plant.delay=-1"], "plant.delay is -1.0 samples"),
         (["plant=real", "plant.counts=0"], "plant.counts is 0.0"),
         (["plant.delay=1"], "setting of plant 'delay' is unknown"),
@@ -87,10 +98,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["store.url=sqlite:///~nobody-here/r.db"], "is '~nobody-here/r.db', but a path is expec"),
         (["store.url=sqlite:///a\nb.db"], "holds the control character '\\\\n'"),
         (["store.url=postgresql://you:secret@host/a\tb"], "holds the control character '\\\\t'"),
-        (
-            ["-m", "store=shards", "launch.share=1/2", "store.folder=$X/y"],
-            "store.folder is '\\$X/y'",
-        ),
         (["store.url=sqlite:////dev"], "/dev is a folder, but a file is expected"),
         (["--cfg", "jobs"], "--cfg 'jobs' is unknown.* did you mean 'job'"),
         (["--bogus"], "option '--bogus' is unknown"),
@@ -444,7 +451,9 @@ def test_a_grid_goes_on_when_its_output_is_closed(
         assert [tuple(row) for row in rows] == [(2,)]
 
 
-@pytest.mark.parametrize("word", [name for name in SUCCESSORS if name.startswith("launch.")])
+@pytest.mark.parametrize(
+    "word", [name for name in SUCCESSORS if name.startswith(("launch.", "executor=", "store="))]
+)
 def test_settings_of_a_launch(command_line: Callable[..., tuple[int, str, str]], word: str) -> None:
     code, output, errors = command_line("-m", word if "=" in word else f"{word}=1")
     assert (code, output) == (2, "")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -16,18 +17,16 @@ from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate import launch
 from orchestrate.__main__ import main
-from orchestrate.config import Combination, Grid, build_grid
-from orchestrate.config.launch_settings import LaunchSettings, Share, share
-from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.runner.start import Work, collected, launch_grid
-from orchestrate.store import NoDatabaseError, Reader, Store, StoreError
-from orchestrate.store.maintenance import collect, examine, merge_collected
+from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
+from orchestrate.errors import ExitCode
+from orchestrate.runner.start import Work, launch_grid
+from orchestrate.store import Reader
+from orchestrate.store.maintenance import examine
 from tests.orchestrate.conftest import RECORD
-from tests.orchestrate.faults.laboratory import flaws, results
-from tests.orchestrate.standins import grid_of, specification
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.faults.laboratory import flaws
+from tests.orchestrate.standins import specification
 from tests.paths import ROOT
-from tests.waiting import until
+from tests.waiting import PATIENCE_SECONDS, until
 
 
 def words(executor: str, url: str) -> list[str]:
@@ -130,120 +129,69 @@ def test_a_checkpoint_beyond_the_end_stops_before_anything_runs() -> None:
         grid({**SHORT, "checkpoints": [9]}, seeds=1)
 
 
-GRID = ("-m", "policy=random", "seed=range(20)", "env.horizon=5", "executor=inprocess")
+GRID = ("policy=random", "env.horizon=5", "executor=inprocess")
 SHARES = 3
 
 Launch = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def launch_share(command_line: Launch, tmp_path: Path) -> Callable[..., str]:
-    """Return a function that runs one share, on a disk of its own, and tells what it said."""
+def share(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Return a function that starts docs/example/share.sh for the first or another share."""
+    with ExitStack() as stack:
 
-    def run(number: int, *more: str) -> str:
-        url = f"store.url=sqlite:///{tmp_path}/disk-{number}/s.db"
-        folder = f"store.folder={tmp_path}/shared"
-        code, said, err = command_line(
-            *GRID, "store=shards", url, folder, f"launch.share={number}/{SHARES}", *more
-        )
-        assert code == 0, err
-        return said
+        def start(number: int = 1, **settings: str) -> subprocess.Popen[str]:
+            path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+            given = {"TMPDIR": str(tmp_path), "SEEDS": "20", "PATH": path, **settings}
+            words = [
+                "bash",
+                "docs/example/share.sh",
+                f"{tmp_path}/shared",
+                f"{number}",
+                f"{SHARES}",
+            ]
+            started = subprocess.Popen(
+                [*words, *GRID],
+                cwd=ROOT,
+                env={**os.environ, **given},
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            return stack.enter_context(started)
 
-    return run
+        yield start
 
 
 def trials(url: str) -> list[tuple[object, ...]]:
     with Reader.open(url) as reader:
-        return sorted(map(tuple, reader.rows("SELECT trial_key, final_loss, status FROM trial")))
+        sql = "SELECT trial_key, final_loss FROM trial WHERE status = 'done'"
+        return sorted(map(tuple, reader.rows(sql)))
 
 
 def test_merged_shares_are_the_rows_of_one_database(
-    launch_share: Callable[..., str], command_line: Launch, tmp_path: Path
+    share: Callable[..., subprocess.Popen[str]],
+    command_line: Launch,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for number in range(1, SHARES + 1):
-        launch_share(number)
+        assert share(number).wait(PATIENCE_SECONDS) == 0
     one, merged = f"sqlite:///{tmp_path}/one.db", f"sqlite:///{tmp_path}/merged.db"
-    assert command_line(*GRID, f"store.url={one}")[0] == 0
+    monkeypatch.setattr("orchestrate.runner.start.WORK", Work(run_trial))
+    assert command_line("-m", *GRID, "seed=range(20)", f"store.url={one}")[0] == 0
     assert main(["merge", f"{tmp_path}/shared", "--db", merged]) == 0
     assert trials(merged) == trials(one)
-    assert results(merged) == results(one)
+    assert losses(merged) == losses(one)
     assert flaws(merged) == []
 
 
-def test_a_share_goes_on_on_another_machine(
-    launch_share: Callable[..., str], tmp_path: Path
+def test_a_share_is_copied_while_it_runs_and_goes_on_elsewhere(
+    share: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    launch_share(1, "seed=range(12)")
-    shutil.rmtree(tmp_path / "disk-1")
-    [copy] = (tmp_path / "shared").glob("s.1-of-3.*.db")
-    copy.rename(copy.with_name("s.1-of-3.elsewhere.db"))
-    done = len(trials(f"sqlite:///{tmp_path}/shared/s.1-of-3.elsewhere.db"))
-    assert done > 0
-    assert f"{done} of " in launch_share(1)
-
-
-def test_shares_are_disjoint_and_complete() -> None:
-    keys = [trial.trial_key for trial in grid_of(["random", "uniform"], seeds=50).trials]
-    shares = [Share(number, 7) for number in range(1, 8)]
-    assert [sum(one.holds(key) for one in shares) for key in keys] == [1] * len(keys)
-
-
-@pytest.mark.parametrize("given", ["0/3", "4/3", "3", "a/b", 3, "1/0"])
-def test_a_wrong_share_is_refused(given: object) -> None:
-    with pytest.raises(LaunchError, match="such as 3/20"):
-        share(given)
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        ((*GRID, "store=shards"), "launch.share is None"),
-        ((*GRID, "store=shards", "launch.share=1/2", "store.url=postgresql://x/y"), "x.db"),
-        (("env=pendulum", "launch.share=1/2"), "launch.share is for grids"),
-        ((*GRID, "launch.share=1/2", "launch.detach=true"), "takes a part of it"),
-        (("env=pendulum", "launch.detach=true"), "launch.detach is for grids"),
-        ((*GRID, "launch.detach=true", "launch.until=ci<5%"), "leave one of the two out"),
-    ],
-)
-def test_what_does_not_go_with_shares_or_leaving_is_refused(
-    command_line: Launch, words: tuple[str, ...], named: str
-) -> None:
-    code, _, err = command_line(*words)
-    assert code == 2
-    assert named in err
-
-
-def test_copies_are_made_while_trials_run(tmp_path: Path) -> None:
-    url, shared = f"sqlite:///{tmp_path}/s.1-of-2.here.db", tmp_path / "shared"
-    settings = LaunchSettings(
-        "local", url, share=Share(1, 2), collect_in=shared, collect_seconds=0.05
-    )
-    with Store.open(url) as store, collected(settings, print):
-        launch = store.begin_launch(LAUNCH)
-        for claim in store.claim(launch, store.register(launch, [Spec(0)]).todo):
-            store.commit(claim, result(), RUN)
-        until(lambda: copied(tmp_path, shared) == 1)
-        store.end_launch(launch, "done")
-    assert [path.name for path in shared.iterdir()] == ["s.1-of-2.here.db"]
-
-
-def copied(tmp_path: Path, shared: Path) -> int:
-    """Merge what is collected so far, as one may at any moment, and count it."""
-    merged = f"sqlite:///{tmp_path}/so-far.db"
-    try:
-        for _ in merge_collected(merged, shared):
-            pass
-        return len(trials(merged))
-    except NoDatabaseError:
-        return 0
-
-
-def test_a_copy_that_cannot_be_made_leaves_the_earlier_one(tmp_path: Path) -> None:
-    url, shared = f"sqlite:///{tmp_path}/s.1-of-2.here.db", tmp_path / "shared"
-    with Store.open(url) as store:
-        store.register(store.begin_launch(LAUNCH), [Spec(0)])
-    collect(url, shared)
-    (tmp_path / "s.1-of-2.here.db").write_bytes(b"no database any more" * 1000)
-    with pytest.raises(StoreError):
-        collect(url, shared)
-    assert len(trials(f"sqlite:///{shared}/s.1-of-2.here.db")) == 1
+    first, copy = share(EVERY="1", SEEDS="5000"), tmp_path / "shared/1-of-3.db"
+    until(lambda: copy.exists() and trials(f"sqlite:///{copy}"))
+    first.terminate()  # as before the end of a job
+    assert first.wait(PATIENCE_SECONDS) == ExitCode.INTERRUPTED
+    done = len(trials(f"sqlite:///{copy}"))
+    assert [path.name for path in copy.parent.iterdir()] == [copy.name]
+    assert f"{min(done, 7)} of 7 already done" in str(share().communicate()[0])

@@ -1,32 +1,22 @@
-"""Thousands of trials with a fault every few seconds, or in many shares, end as if undisturbed."""
+"""Thousands of trials with a fault every few seconds end as if undisturbed."""
 
 from __future__ import annotations
 
 import os
 import random
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from tabulate import tabulate
 
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings, Share
-from orchestrate.errors import ExitCode
-from orchestrate.runner.start import Work, launch_grid
-from orchestrate.store.maintenance import merge_collected
-from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.faults.conftest import (  # noqa: F401  fixtures, which pytest finds here
     laboratory_at,
     postgresql_url,
     server,
     undisturbed,
 )
-from tests.orchestrate.faults.laboratory import Laboratory, Server, flaws, preempt, results
+from tests.orchestrate.faults.laboratory import Laboratory, Server, preempt
 from tests.orchestrate.faults.test_workers import register
-from tests.orchestrate.faults.trials import outcome
-from tests.orchestrate.standins import specification
 from tests.soak.disturbances import ON_POSTGRESQL, ON_SQLITE, Supervisor
 
 At = Callable[..., Laboratory]
@@ -84,33 +74,3 @@ def test_workers_survive_a_preemption_every_second_or_two(
 def attempts(laboratory: Laboratory) -> list[tuple[str, int]]:
     sql = "SELECT coalesce(outcome, 'running'), count(*) FROM attempt GROUP BY 1 ORDER BY 1"
     return [(str(row[0]), int(row[1])) for row in laboratory.query(sql)]
-
-
-SHARED_TRIALS, SHARES, HORIZON = 10_000, 20, 50
-
-
-def run(grid: Grid, settings: LaunchSettings) -> None:
-    work = Work(outcome)
-    assert launch_grid(grid, settings, RECORD, work, lambda _: None, None) == ExitCode.DONE
-
-
-def test_twenty_shares_become_one_database(tmp_path: Path, tell: Callable[[str], None]) -> None:
-    first = specification(0, horizon=HORIZON)
-    trials = [first.with_seed(seed) for seed in range(SHARED_TRIALS)]
-    grid = Grid(trials, n_jobs=SHARED_TRIALS, left_out={})
-    one, merged = f"sqlite:///{tmp_path}/one.db", f"sqlite:///{tmp_path}/merged.db"
-    run(grid, LaunchSettings("inprocess", one))
-    shared = tmp_path / "shared"
-    for number in range(1, SHARES + 1):
-        part = Share(number, SHARES)
-        place = f"sqlite:///{tmp_path}/disk/s.{part}.here.db"
-        run(
-            grid.only(part.holds),
-            LaunchSettings("inprocess", place, share=part, collect_in=shared),
-        )
-    start = time.monotonic()
-    added = sum(sum(one.added.values()) for one in merge_collected(merged, shared))
-    tell(f"{added:,} trials merged in {time.monotonic() - start:.1f} s")
-    assert added == SHARED_TRIALS
-    assert results(merged) == results(one)
-    assert flaws(merged) == []

@@ -6,7 +6,7 @@ import os
 import sys
 
 from dopt.process import usable_cores
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import LaunchSettings
 from orchestrate.executors.base import Executor, ExecutorFactory, Prepare, Run, limits_of
 
 if "ray" not in sys.modules:

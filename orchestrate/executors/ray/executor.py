@@ -189,13 +189,16 @@ def start(begin: Callable[[], None]) -> None:
                 begin()
             return
         except DoptError as error:
-            _kill(_children() - before)  # what has started, which would keep the cores busy
+            for process in _children() - before:  # they would keep the cores busy
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
             if not isinstance(error, InfrastructureError):
                 raise
             if attempt == ATTEMPTS:
                 raise InfrastructureError(
-                    f"{error} It was tried {ATTEMPTS} times; {_load()}: run the same command again "
-                    "when fewer programs run."
+                    f"{error} It was tried {ATTEMPTS} times; the load is {os.getloadavg()[0]:.1f} "
+                    f"on {usable_cores()} cores: run the same command again when fewer programs "
+                    "run."
                 ) from error
 
 
@@ -238,16 +241,6 @@ def _raylet_lives() -> bool:
             if name == "raylet" and state not in "ZX":
                 return True
     return False
-
-
-def _kill(processes: set[int]) -> None:
-    for process in processes:
-        with suppress(ProcessLookupError):
-            os.kill(process, signal.SIGKILL)
-
-
-def _load() -> str:
-    return f"the load is {os.getloadavg()[0]:.1f} on {usable_cores()} cores"
 
 
 CONNECT_SECONDS = 5.0
@@ -403,14 +396,11 @@ class ClusterWatch:
             with suppress(Exception):  # any error means "no answer"
                 # Ray itself would wait for a lost head.
                 socket.create_connection((host, int(port)), QUERY_INTERVAL_SECONDS).close()
-                self.cores = _cores()
+                nodes = ray.nodes()  # type: ignore[no-untyped-call]
+                alive = (node["Resources"] for node in nodes if node["Alive"])
+                self.cores = int(sum(one.get("CPU", 0) for one in alive))
                 self._answers += 1
             self._over.wait(QUERY_INTERVAL_SECONDS)
-
-
-def _cores() -> int:
-    nodes = ray.nodes()  # type: ignore[no-untyped-call]
-    return int(sum(node["Resources"].get("CPU", 0) for node in nodes if node["Alive"]))
 
 
 _WORKER_LOST = (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError)
@@ -523,7 +513,9 @@ class RayExecutor(Executor):
             return self._lose(stream, error)
         except _NODE_LOST as error:
             keys = tuple(task.key for task in self._chunks.pop(stream).tasks)
-            return [WorkerLost(keys, _loss(error), node_lost=True)] if keys else []
+            address = re.search(r"Node IP: ([\w.:]+)", str(error))
+            loss = f"lost with its machine {address[1]}" if address else "lost"
+            return [WorkerLost(keys, loss, node_lost=True)] if keys else []
         except exceptions.RayError as error:
             raise InfrastructureError(
                 f"Ray failed ({first_line(error)}): run the same command again to continue."
@@ -552,9 +544,3 @@ class RayExecutor(Executor):
         cause = "out of memory" if out_of_memory else "killed"
         reason = f"ended unexpectedly ({first_line(error)})"
         return [WorkerLost(keys, reason, cause=cause)] if keys else []
-
-
-def _loss(error: Exception) -> str:
-    """Return the description of a lost node, with its address if Ray knows it."""
-    address = re.search(r"Node IP: ([\w.:]+)", str(error))
-    return f"lost with its machine {address[1]}" if address else "lost"

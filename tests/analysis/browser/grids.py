@@ -11,8 +11,7 @@ from httpx import Response
 from starlette.testclient import TestClient
 
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.runner.start import Work, launch_grid
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
 from tests.analysis.synthetic import fake_result, fill, make_grid

@@ -31,7 +31,6 @@ from dopt.policies.base import OpenLoop
 from dopt.systems import System
 from dopt.types import Array
 from orchestrate.__main__ import main
-from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store, StoreError, StoreUnavailableError
 from orchestrate.store import store as writing
 from orchestrate.store.maintenance import examine
@@ -108,7 +107,7 @@ def test_a_merge_takes_it_and_what_it_has_grown_by(url: str, tmp_path: Path, run
     assert merge(url, target).kept == 1, "there are fewer steps"
     assert merge(target, url).added == {"done": 1}
     assert content(target) == content(url)
-    assert not examine(target, trial_key)
+    assert not examine(target)
 
 
 def test_another_run_of_these_arguments_stays_apart(
@@ -224,7 +223,7 @@ def test_a_database_that_is_gone_is_said_and_written_anew(
     drive(run, 5)
     assert run.save(sqlite_url)
     assert content(sqlite_url)["n_steps"] == 50
-    assert not examine(sqlite_url, trial_key)
+    assert not examine(sqlite_url)
     run.close()
 
 
@@ -291,7 +290,7 @@ def test_saved_on_the_way_is_saved_at_the_end(
         run.close()
     run.save(end)
     assert content(url) == content(end)
-    assert not examine(url, trial_key)
+    assert not examine(url)
 
 
 def test_beside_a_trial_of_the_same_system_it_is_another_configuration(sqlite_url: str) -> None:
@@ -312,7 +311,7 @@ def test_beside_a_trial_of_the_same_system_it_is_another_configuration(sqlite_ur
     assert selection.notes == (
         "pendulum: 1 other stored configurations are not part of this (see --where)",
     )
-    assert not examine(sqlite_url, trial_key)
+    assert not examine(sqlite_url)
 
 
 def test_the_error_on_a_test_run_is_stored(sqlite_url: str, run: Explorer) -> None:
@@ -383,7 +382,7 @@ def test_a_save_that_fails_in_the_middle_leaves_what_was_stored(
     drive(run, 20)
     assert run.save(url)
     assert content(url)["n_steps"] == 80
-    assert not examine(url, trial_key)
+    assert not examine(url)
 
 
 def test_a_locked_database_is_said_and_the_exploration_goes_on(
@@ -456,7 +455,7 @@ def test_parameters_that_are_not_finite_end_it_as_diverged(sqlite_url: str) -> N
         curves = reader.curves(config.config_key)
     assert (trial.status, trial.diverged_at, trial.n_steps) == ("diverged", at, at)
     assert np.array_equal(np.isfinite(curves.values[0]), np.arange(STEPS) < at)
-    assert not examine(sqlite_url, trial_key)
+    assert not examine(sqlite_url)
     with Store.open(sqlite_url) as store:
         assert store.retry("all") == 0, "no launch can run it again"
 

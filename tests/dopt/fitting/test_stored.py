@@ -18,7 +18,6 @@ from analysis.serve.app import create_app
 from dopt.fitting.fitted import Fitted
 from dopt.systems.plant import Plant
 from orchestrate.__main__ import main
-from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, StoreError
 from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import merge
@@ -102,7 +101,7 @@ def test_a_fit_has_one_row_and_another_its_own(
     assert rows(url, "SELECT count(*), max(attempt) FROM attempt") == [(2, 2)]
     assert len({key, fit().store(url), *(other.store(url) for other in others)}) == 6
     assert rows(url, "SELECT count(*) FROM trial") == [(6,)]
-    assert not examine(url, trial_key)
+    assert not examine(url)
     with pytest.raises(StoreError, match=r"write it as sqlite:///results\.db"):
         found.store("results.db")
 

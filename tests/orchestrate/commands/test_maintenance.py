@@ -12,14 +12,12 @@ from typing import Any
 import pytest
 from sqlalchemy.engine import make_url
 
-from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store
 from orchestrate.store.maintenance import back_up
 from orchestrate.store.merge import merge
 from orchestrate.store.records import utc_text
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer, on_both
-from tests.orchestrate.standins import specification
 from tests.orchestrate.store.databases import execute, restored
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, everything, result, run_all
 from tests.orchestrate.store.released import restore
@@ -121,10 +119,6 @@ class TestDoctor:
         with Reader.open(new) as reader:
             assert sum(config.n_done for config in reader.configs()) == 3
 
-    def test_knows_the_key_of_a_trial(self) -> None:
-        trial = specification(seed=12345678901)
-        assert trial_key(trial.config_json, trial.seed) == trial.trial_key
-
 
 TABLES = ("trial", "step", "curve", "trajectory", "attempt", "config", "error")
 
@@ -166,7 +160,7 @@ class TestBackup:
         self, grid: int, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         if url.startswith("sqlite"):
-            monkeypatch.setattr("orchestrate.store.backends.base.sqlite3.connect", short)
+            monkeypatch.setattr("orchestrate.store.backend.sqlite3.connect", short)
         else:
             said = "pg_dump: error: could not write to file: No space left on device"
             program = tmp_path / "bin" / "pg_dump"

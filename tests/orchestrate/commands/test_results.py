@@ -6,11 +6,8 @@ import csv
 import importlib
 import io
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -88,7 +85,7 @@ def test_every_command_has_help_and_the_common_options(command: Command, capsys:
         (["status", "more"], "unexpected argument 'more'"),
         (["query", "SELECT 1", "--limit", "0"], "a whole number above 0 is expected"),
         (["query", "SELECT 1", "--timeout", "nan"], "a number above 0 is expected"),
-        (["status", "--watch", "soon"], "a number above 0 is expected"),
+        (["status", "--watch"], "'status --watch' was removed: watch python -m orchestrate"),
         (["show", "--seed", "one"], "a whole number from 0 to 2^63 - 1 is expected"),
         (["export", "curves", "--out", "x", "--format", "parket"], "did you mean 'parquet'?"),
         (["export", "curves", "--out", "curves.xlsx"], "give --format"),
@@ -196,26 +193,6 @@ def test_a_reader_that_has_seen_enough_ends_it_quietly(sqlite_url: str) -> None:
     assert running.stderr.read() == b""
     running.stderr.close()
     assert running.wait(timeout=PATIENCE_SECONDS) == 0
-
-
-def test_ctrl_c_ends_a_watch_with_130(sqlite_url: str) -> None:
-    with Store.open(sqlite_url) as store:
-        store.register(store.begin_launch(LAUNCH), [Spec()])
-        program = [sys.executable, "-m", "orchestrate", "status", "--watch", "0.1"]
-        running = subprocess.Popen(
-            [*program, "--db", sqlite_url],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        )
-        assert running.stdout is not None
-        assert b"0 of 1 trials" in running.stdout.readline()
-        time.sleep(0.2)
-        running.send_signal(signal.SIGINT)
-        _, err = running.communicate(timeout=PATIENCE_SECONDS)
-    assert running.returncode == ExitCode.INTERRUPTED
-    assert err == b""
 
 
 Run = Callable[..., Answer]

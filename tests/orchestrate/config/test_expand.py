@@ -184,22 +184,6 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
     assert [one.seeds for one in together] == [(0, 1, 2, 3)]
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("env=glob(frist)", "no name of env matches the pattern 'frist': did you mean 'first'"),
-        ("seed=range(5,5)", "has no values"),
-        ("seed=range(5,1)", "has no values"),
-        ("scale=interval(0,1)", "no finite list"),
-        ("width=glob(*)", "is not a group"),
-        ("launch.workers=1,2", "setting of the launch"),
-    ],
-)
-def test_sweeps_without_values_are_errors(sample: Sample, override: str, words: str) -> None:
-    with pytest.raises((SpecificationError, HydraException), match=words):
-        expanded(sample, [override], sections=SECTIONS)
-
-
 MIXED: list[tuple[list[str], list[list[str]]]] = [
     (
         ["model=linear,mlp", "model.order=2,3", "seed=range(2)"],

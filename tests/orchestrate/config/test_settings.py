@@ -12,16 +12,14 @@ import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import Control
-from dopt.errors import IncompatibleError, SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
 from dopt.registry import build
 from dopt.spec.trial import TrialSpec
 from dopt.systems import NAMED_SYSTEMS
-from orchestrate.config import Combination, build_grid
+from orchestrate.config import Combination, LaunchSettings, build_grid
 from orchestrate.config.command_line import read_command_line
-from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.options import option_names
 from tests.paths import ROOT
 
@@ -160,25 +158,6 @@ def test_an_integer_and_an_equal_float_name_one_trial() -> None:
     assert len(grid.trials) == 1
 
 
-def test_a_pair_that_makes_no_sense_is_left_out_with_the_reason() -> None:
-    periodic = {"name": "periodic"}
-    grid = build_grid([combination(), combination(env={"name": "quadrotor"}, policy=periodic)])
-    [(reason, count)] = grid.left_out.items()
-    assert count == 2
-    assert reason.startswith("env=quadrotor policy=periodic: ")
-    assert "eigenmode" in reason
-    assert len(grid.trials) == 2
-    assert grid.repeats == 0
-
-
-def test_alone_such_a_pair_is_an_error_and_so_is_a_grid_of_nothing_else() -> None:
-    pair = combination(env={"name": "quadrotor"}, policy={"name": "periodic"})
-    with pytest.raises(IncompatibleError):
-        build_grid([pair], single=True)
-    with pytest.raises(SpecificationError, match="the grid is empty: env=quadrotor"):
-        build_grid([pair])
-
-
 OWN_GRID = {"_target_": "tests.dopt.custom_networks.Stack"}
 
 
@@ -226,6 +205,8 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.timeout=true", "launch.timeout"),
         ("launch.memory_gib=0", "launch.memory_gib is 0, but null or a number of GiB above 0"),
         ("launch.retry_memory=2", "launch.retry_memory is 2, but there is no limit that it could"),
+        ("launch.retry_memory=1", "launch.retry_memory is 1, but null or a factor above 1, at mo"),
+        ("launch.until=ci<5%", "a single trial is asked for: add -m"),
         ("launch.lease=null", "launch.lease"),
         ("assess.sample_loss=yes please", "'assess' is {'sample_loss': 'yes please'}, but"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
@@ -236,14 +217,6 @@ def test_what_is_refused(command_line: CommandLine, word: str, sentence: str) ->
     code, output, errors = command_line(*TRIAL, word)
     assert (code, output, errors.count("\n")) == (2, "", 1)
     assert sentence in errors
-
-
-def test_a_factor_of_memory_is_above_one(command_line: CommandLine) -> None:
-    code, _, errors = command_line(*TRIAL, "launch.memory_gib=1", "launch.retry_memory=1")
-    assert code == 2
-    assert (
-        "launch.retry_memory is 1, but null or a factor above 1, at most 100, is expected" in errors
-    )
 
 
 GRID = ("-m", "policy=d_optimal,random", "env.horizon=5", "seed=range(20)", "executor=inprocess")
@@ -272,12 +245,6 @@ def test_what_is_no_rule_is_refused(
     code, output, errors = command_line(*GRID, *words)
     assert (code, output, errors.count("\n")) == (2, "", 1)
     assert sentence in errors
-
-
-def test_a_single_trial_has_no_seeds_to_choose_from(command_line: CommandLine) -> None:
-    code, _, errors = command_line("env.horizon=5", "launch.until=ci<5%")
-    assert code == 2
-    assert "a single trial is asked for: add -m" in errors
 
 
 def test_a_dry_run_says_that_these_are_the_most(command_line: CommandLine) -> None:
@@ -357,34 +324,38 @@ def test_a_setting_holds_for_the_grids_that_have_it(
 SHORT = ("env.horizon=5", "executor=inprocess")
 
 
-def test_a_setting_holds_for_the_choices_that_have_it(command_line: CommandLine) -> None:
-    code, output, errors = command_line(
-        "-m", "env=arm", "policy=random,uniform,d_optimal", "policy.regularization=1e-2,1e-3",
-        "model.depth=1", "seed=0,1", "launch.dry_run=true",
-    )  # fmt: skip
-    assert (code, errors) == (0, "")
-    assert "policy.regularization applies to policy=d_optimal only\n" in output
-    assert "model.depth" not in output
-    assert "8 trials, 0 done, 8 to run" in output  # 2 random, 2 uniform, 4 D-optimal
-
-
 @pytest.mark.parametrize(
-    ("choice", "setting", "note"),
+    ("words", "note", "trials"),
     [
-        ("policy=beyond/exact,beyond/trace", "policy.budget_us=20", ""),
-        ("policy=d_optimal,beyond/exact", "policy.candidates=8", "policy=exact"),
-        ("learner=ekf,adam_window", "learner.forgetting=0.99", "learner=ekf"),
-        ("task=none,control", "task.steps=60", "task=control"),
+        (  # 2 random, 2 uniform, 4 D-optimal
+            "env=arm policy=random,uniform,d_optimal policy.regularization=1e-2,1e-3 model.depth=1 "
+            "seed=0,1",
+            "policy.regularization applies to policy=d_optimal only\n",
+            8,
+        ),
+        ("policy=beyond/exact,beyond/trace policy.budget_us=20 seed=0", "", 2),
+        (
+            "policy=d_optimal,beyond/exact policy.candidates=8 seed=0",
+            "policy.candidates applies to policy=exact only\n",
+            2,
+        ),
+        (
+            "learner=ekf,adam_window learner.forgetting=0.99 seed=0",
+            "learner.forgetting applies to learner=ekf only\n",
+            2,
+        ),
+        ("task=none,control task.steps=60 seed=0", "task.steps applies to task=control only\n", 2),
+        ("policy=random,oracle model.depth=3 seed=0", "model.depth applies to model=mlp only\n", 2),
     ],
 )
-def test_a_single_value_may_be_one_that_the_default_choice_lacks(
-    command_line: CommandLine, choice: str, setting: str, note: str
+def test_a_setting_holds_for_the_choices_that_have_it(
+    command_line: CommandLine, words: str, note: str, trials: int
 ) -> None:
-    code, output, errors = command_line("-m", choice, setting, "seed=0", "launch.dry_run=true")
+    code, output, errors = command_line("-m", *words.split(), "launch.dry_run=true")
     assert (code, errors) == (0, "")
-    key = setting.partition("=")[0]
-    assert output.startswith(f"{key} applies to {note} only\n") == bool(note)
-    assert "2 trials, 0 done, 2 to run" in output
+    assert output.startswith(note or "env ")
+    assert output.count(" applies to ") == bool(note)
+    assert f"{trials} trials, 0 done, {trials} to run" in output
 
 
 def test_a_setting_of_the_launch_may_refer_to_one_of_a_trial(
@@ -393,19 +364,3 @@ def test_a_setting_of_the_launch_may_refer_to_one_of_a_trial(
     named = "store.url=sqlite:///of${env.horizon}.db"
     assert command_line("-m", "policy=random,oracle", "seed=0", named, *SHORT)[0] == 0
     assert (tmp_path / "of5.db").exists()
-
-
-def test_a_setting_of_a_model_that_one_policy_brings_along(command_line: CommandLine) -> None:
-    code, output, _ = command_line(
-        "-m", "policy=random,oracle", "model.depth=3", "seed=0", "launch.dry_run=true"
-    )
-    assert code == 0
-    assert output.startswith("model.depth applies to model=mlp only\n")
-    assert "2 trials" in output
-
-
-def test_a_helper_that_another_setting_refers_to_is_read(command_line: CommandLine) -> None:
-    arguments = ("-m", "+strength=3,4", "env.gamma=${strength}", "seed=0", "launch.dry_run=true")
-    code, output, errors = command_line(*arguments)
-    assert (code, errors) == (0, "")
-    assert "2 trials" in output

@@ -32,7 +32,6 @@ from tests.orchestrate.standins import (
     deadly,
     exiting,
     malformed,
-    quick,
     raising,
 )
 from tests.orchestrate.unruly import (
@@ -136,13 +135,6 @@ def test_the_rest_of_its_chunk_runs_without_being_charged(executor: str) -> None
     assert all(isinstance(event.outcome, TrialResult) for event in finished)
 
 
-def test_a_timeout_is_tried_again_only_when_asked(launches: Launches) -> None:
-    launches(hanging, timeout=LIMIT)
-    assert launches(quick, timeout=LIMIT) == ExitCode.SOME_FAILED
-    assert launches(quick, timeout=LIMIT, retry="failed") == ExitCode.DONE
-    assert launches.statuses()[BROKEN_SEED] == "done"
-
-
 def test_a_long_trial_of_the_kernel_heeds_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     short, spec = (
         trial("quadrotor", "d_optimal", env={"horizon": steps}, model={"width": 48})
@@ -161,10 +153,6 @@ def test_a_long_trial_of_the_kernel_heeds_its_limit(monkeypatch: pytest.MonkeyPa
     assert isinstance(finished.outcome, Failure)
     assert finished.outcome.cause == "timeout"
     assert "in advance" in finished.outcome.traceback
-
-
-def test_no_limit_is_no_limit(launches: Launches) -> None:
-    assert launches(quick, timeout=None) == ExitCode.DONE
 
 
 def test_somebody_elses_timer_goes_on() -> None:

@@ -1,9 +1,11 @@
-"""Ray: an instance of the launch, and a cluster whose nodes and head are lost."""
+"""Ray: an instance of the launch, and what is refused of a cluster.
+
+A cluster whose nodes and head are lost is in ``tests/machines/test_cluster.py``.
+"""
 
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 import signal
@@ -24,7 +26,6 @@ from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import WorkerLost
 from orchestrate.executors.ray import executor as ray_start
 from orchestrate.executors.ray.executor import (
-    SETTINGS_FILE,
     RayExecutor,
     first_line,
     run_where_alike,
@@ -33,10 +34,6 @@ from orchestrate.executors.ray.executor import (
     unreachable,
 )
 from orchestrate.fingerprint import fingerprint
-from orchestrate.store import Reader
-from tests.machines.hosts import unavailable
-from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, ROOT, SEEDS
-from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.conftest import ON_RAY, WORKERS
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.faults.laboratory import children
@@ -187,87 +184,6 @@ def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
     assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED, 3]
 
 
-NAMESPACES = ["--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc"]
-SCRIPT = """
-ip link set lo up
-for address in $ADDRESSES; do ip address add "$address/32" dev lo; done
-mkdir -p /tmp/ray
-mount -t tmpfs ray /tmp/ray
-exec "$@"
-"""
-
-
-class Outcome:
-    """What the launches reported, and their databases."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.report: dict[str, dict[str, Any]] = json.loads((folder / "report.json").read_text())
-
-    def query(self, name: str, sql: str) -> list[tuple[Any, ...]]:
-        with Reader.open(f"sqlite:///{self._folder / name}.db") as reader:
-            return [tuple(row) for row in reader.rows(sql)]
-
-
-CURVES = "SELECT seed, t, loss, reachable_loss FROM v_curve ORDER BY seed, t"
-
-
-@pytest.fixture(scope="module")
-def outcome(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    """Start a cluster in namespaces of its own and run every launch on it."""
-    probe = subprocess.run(["unshare", *NAMESPACES, "true"], capture_output=True, text=True)
-    if probe.returncode:
-        unavailable(f"needs root and network namespaces: {probe.stderr.strip()}")
-    folder = tmp_path_factory.mktemp("cluster")
-    settings = dict(
-        line.split("=") for line in SETTINGS_FILE.read_text().splitlines() if line[:4] == "RAY_"
-    )
-    # Not from the folder of the code, which Ray would offer to the nodes.
-    process = subprocess.run(
-        ["setpriv", "--pdeathsig", "KILL", "unshare", *NAMESPACES, "--", "sh", "-ec", SCRIPT, "sh",
-         sys.executable, "-m", "tests.orchestrate.clustered_launches", str(folder)],
-        cwd=folder, capture_output=True, text=True,
-        env={**os.environ, **settings, "ADDRESSES": " ".join(ADDRESSES), "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert process.returncode == 0, process.stdout + process.stderr
-    return Outcome(folder)
-
-
-@pytest.fixture
-def undisturbed(launches: Launches) -> list[tuple[Any, ...]]:
-    launches(seeds=SEEDS)
-    return launches.query(CURVES)
-
-
-def test_a_node_that_joins_later_is_prepared_and_gets_its_share(
-    outcome: Outcome, undisturbed: list[tuple[Any, ...]]
-) -> None:
-    assert outcome.report["added"].items() >= {
-        "code": 0, "both nodes": True, "prepared": True,
-    }.items()  # fmt: skip
-    assert outcome.query("added", CURVES) == undisturbed
-    assert outcome.query("added", "SELECT max(attempt) FROM trial") == [(1,)]
-
-
-def test_a_lost_node_costs_its_trials_nothing(
-    outcome: Outcome, undisturbed: list[tuple[Any, ...]]
-) -> None:
-    """A trial that had killed its worker as often would have failed."""
-    assert outcome.report["lost"]["code"] == 0, outcome.report["lost"]
-    assert outcome.query("lost", CURVES) == undisturbed
-    sql = f"SELECT status, attempt FROM trial WHERE seed = {LONG_SEED}"
-    assert outcome.query("lost", sql) == [("done", LOSSES + 1)]
-    assert outcome.query("lost", "SELECT DISTINCT outcome, cause FROM attempt ORDER BY 1") == [
-        ("done", None), ("released", "node lost"),
-    ]  # fmt: skip
-
-
-def test_a_node_of_other_code_is_refused_before_it_computes_anything(outcome: Outcome) -> None:
-    assert outcome.report["other_code"]["code"] == 75
-    assert "the code of dopt is" in outcome.report["other_code"]["error"]
-    assert outcome.query("other_code", "SELECT DISTINCT status FROM trial") == [("pending",)]
-
-
 def test_a_node_of_other_settings_says_so_and_runs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     name = "RAY_health_check_period_ms"
     monkeypatch.setenv(name, "1000")
@@ -275,14 +191,6 @@ def test_a_node_of_other_settings_says_so_and_runs_nothing(monkeypatch: pytest.M
     monkeypatch.setenv(name, "2000")
     [difference] = run_where_alike(expected, b"no payload is read")
     assert difference.endswith("period_ms is 2000, here it is 1000")
-
-
-def test_the_loss_of_the_head_ends_the_launch_and_frees_its_claims(outcome: Outcome) -> None:
-    assert outcome.report["headless"]["code"] == 75
-    assert "has not answered for 3 s" in outcome.report["headless"]["error"]
-    running = "SELECT count(*) FROM trial WHERE status = 'running'"
-    assert outcome.query("headless", running) == [(0,)]
-    assert outcome.query("headless", "SELECT state FROM launch") == [("failed",)]
 
 
 @pytest.mark.parametrize("address", ["ray://10.0.0.1:10001", "head", "me:secret@head:6379"])

@@ -20,16 +20,16 @@ from typing import Any
 
 import psycopg
 
+from orchestrate.config import LaunchSettings
 from orchestrate.config.command_line import Request
-from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import local
 from orchestrate.runner import scheduler, start, worker
 from orchestrate.runner.start import Output, Work
 from orchestrate.runner.worker import run_worker
 from orchestrate.store import Store, StoreUnavailableError
-from orchestrate.store.backends.postgresql import PostgreSQLBackend
-from orchestrate.store.backends.sqlite import SQLiteBackend
+from orchestrate.store.postgresql import PostgreSQLBackend
+from orchestrate.store.sqlite import SQLiteBackend
 from tests.orchestrate import lean_ray
 from tests.orchestrate.faults.trials import Gate, Gated, Standin, grid_of, rest
 

@@ -12,8 +12,7 @@ import pytest
 
 from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Combination, Grid, build_grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
 from orchestrate.errors import LaunchError
 from orchestrate.records import RunRecord
 from orchestrate.runner.saving import RetryingStore
@@ -153,16 +152,16 @@ def test_nothing_starts_that_may_end_too_late(build: Build) -> None:
     assert late.waiting == 100
 
 
-def test_the_first_trial_of_its_kind_may_take_half_of_the_time(build: Build) -> None:
-    chunks, _ = build(trials_of("random", 5), {}, length=100.0)
-    assert len(chunks.next()) == 1
-    chunks.pending = 2
-    assert len(chunks) == 0
-
-
-def test_what_runs_counts_for_what_waits_behind_it(build: Build) -> None:
-    chunks, _ = build(trials_of("random", 50), {"random": 3.0}, length=8.0)
-    chunks.next()
+@pytest.mark.parametrize(
+    ("measured", "length", "size"),
+    [({}, 100.0, 1), ({"random": 3.0}, 8.0, 1)],
+    ids=["the first of its kind may take half of the time", "what runs counts for what waits"],
+)
+def test_a_process_that_is_busy_leaves_no_time(
+    build: Build, measured: dict[str, float], length: float, size: int
+) -> None:
+    chunks, _ = build(trials_of("random", 50), measured, length=length)
+    assert len(chunks.next()) == size
     assert len(chunks) > 0
     chunks.pending = 2
     assert len(chunks) == 0
@@ -184,26 +183,10 @@ def test_a_trial_that_killed_a_process_goes_alone(store: Store, build: Build) ->
     assert sorted(itertools.chain.from_iterable(found)) == list(range(10))
 
 
-def test_what_this_machine_cannot_build_is_left_to_others(
-    build: Build, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("orchestrate.runner.worker.memory_of_this_machine", lambda: 10)
-    chunks, said = build(trials_of("random", 4), {})
-    assert len(chunks) == 0
-    assert (chunks.left, chunks.left_here, chunks.waiting) == (4, 0, 0)
-    assert said == [one for one in said if "give a lower --processes" in one]
-    chunks.look()
-    assert len(said) == 1
-
-
 def stored(**changes: object) -> OpenConfig:
     spec = short_trial("random", 0)
     content = {**json.loads(spec.config_json), **changes}
     return OpenConfig(1, spec.config_key, json.dumps(content), 3, 0, None, None)
-
-
-def test_a_trial_is_built_from_what_is_stored() -> None:
-    assert trial_of(stored(), 1).trial_key == short_trial("random", 0).trial_key
 
 
 ELSEWHERE = {"_target_": "systems_of_mine.Rocket", "source": "0" * 16}

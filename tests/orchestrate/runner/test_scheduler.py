@@ -15,8 +15,7 @@ import pytest
 from dopt.errors import UnusableEnvironmentError
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Event, Executor, Task, WorkerLost, run_task
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
@@ -33,13 +32,6 @@ from tests.orchestrate.standins import (
     specification,
     unusable,
 )
-
-
-def test_the_same_command_again_runs_nothing_and_says_so(launches: Launches) -> None:
-    assert launches(quick) == ExitCode.DONE
-    assert "0 of 5 already done, 5 to run" in launches.said[0]
-    assert launches(raising) == ExitCode.DONE
-    assert "5 of 5 already done, nothing to run" in launches.said[-1]
 
 
 def test_a_larger_grid_runs_only_what_is_new(launches: Launches) -> None:
@@ -93,15 +85,6 @@ def test_a_diverged_trial_is_a_result_that_is_kept(launches: Launches) -> None:
     assert launches.statuses()[BROKEN_SEED] == "diverged"
     assert launches(quick, retry="all") == ExitCode.DONE
     assert launches.statuses()[BROKEN_SEED] == "done"
-
-
-def test_rows_do_not_depend_on_the_executor(launches: Launches) -> None:
-    launches(quick)
-    here = launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t")
-    launches.url = launches.url.replace("results.db", "other.db")
-    launches(quick, executor="local", chunk_seconds=1e-9)
-    assert launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t") == here
-    assert launches.query("SELECT state, host FROM launch") == [("done", "here")]
 
 
 def test_the_trials_of_a_dead_launch_are_taken_over(launches: Launches) -> None:

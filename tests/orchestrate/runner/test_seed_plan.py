@@ -14,8 +14,7 @@ import pytest
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config import Grid
-from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
 from orchestrate.runner.scheduler import (

@@ -21,10 +21,6 @@ from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged,
 Take = Callable[..., list[Claim]]
 
 
-def key(config_json: str, seed: int) -> str:
-    return hashlib.sha256(f'{config_json[:-1]},"seed":{seed}}}'.encode()).hexdigest()
-
-
 @pytest.fixture
 def grid(store: Store, launch: int, take: Take, url: str) -> str:
     """Three finished trials of two policies each, one of them diverged; return the URL."""
@@ -43,7 +39,7 @@ def harm(url: str, *statements: str) -> None:
 def only(url: str) -> Finding:
     """Return the one finding; nothing in the database may have changed."""
     before = contents(url, columns(url))
-    (found,) = examine(url, key)
+    (found,) = examine(url)
     assert contents(url, columns(url)) == before
     return found
 
@@ -57,7 +53,7 @@ def test_results_of_different_code_are_noted(grid: str) -> None:
         f"INSERT INTO launch ({more}) SELECT {copied} FROM launch",
         "UPDATE trial SET launch_id = 2 WHERE trial_id = 1",
     )
-    assert examine(grid, key) == [], "the code of an older program is unknown"
+    assert examine(grid) == [], "the code of an older program is unknown"
     harm(grid, """UPDATE launch SET fingerprint = '{"code of dopt": "b"}' WHERE launch_id = 2""")
     one = only(grid)
     assert (one.severity, one.count) == ("note", 1)
@@ -65,7 +61,7 @@ def test_results_of_different_code_are_noted(grid: str) -> None:
 
 
 def test_nothing_is_wrong(grid: str) -> None:
-    assert examine(grid, key) == []
+    assert examine(grid) == []
 
 
 @pytest.mark.parametrize(
@@ -89,7 +85,7 @@ def test_damage_is_found(grid: str, harms: str, severity: str, words: str, count
     infinity = "9e999" if grid.startswith("sqlite") else "'infinity'"
     harm(grid, harms.replace("{inf}", infinity))
     before = contents(grid, columns(grid))
-    findings = examine(grid, key)
+    findings = examine(grid)
     assert contents(grid, columns(grid)) == before
     found = next(one for one in findings if words in one.sentence)
     assert (found.severity, found.count) == (severity, count)
@@ -116,10 +112,10 @@ def test_damaged_assessments(store: Store, take: Take, url: str, harms: str, wor
     for claim, seed in zip(take(Spec(0), Spec(1)), (0, 1), strict=True):
         store.commit(claim, assessed(seed), RUN)
     store.end_launch(1, "done")
-    assert examine(url, key) == []
+    assert examine(url) == []
     infinity = "9e999" if url.startswith("sqlite") else "'infinity'"
     harm(url, harms.replace("{inf}", infinity))
-    assert words in " ".join(one.sentence for one in examine(url, key))
+    assert words in " ".join(one.sentence for one in examine(url))
 
 
 def test_a_task_without_an_assessment(store: Store, take: Take, url: str) -> None:
@@ -146,7 +142,7 @@ def test_claims_of_the_dead(url: str) -> None:
         launch = store.begin_launch(LAUNCH)
         store.claim(launch, store.register(launch, [Spec(0), Spec(1)]).todo)
     harm(url, "UPDATE launch SET lease_until = 0")  # for SQLite the process is gone already
-    found = examine(url, key)
+    found = examine(url)
     assert [(one.severity, one.count) for one in found] == [("note", 1), ("note", 2)]
     assert "trials held by launches that do not run: 2" in found[1].sentence
 
@@ -154,7 +150,7 @@ def test_claims_of_the_dead(url: str) -> None:
 def test_a_launch_that_lives_is_no_finding(store: Store, take: Take, url: str) -> None:
     take(Spec(0))
     assert store.recover() == 0
-    assert examine(url, key) == []
+    assert examine(url) == []
 
 
 @pytest.fixture
@@ -200,7 +196,7 @@ def test_overwritten_pages_are_never_read_as_numbers(
     data[4096 * page : 4096 * (page + 1)] = numbers.randbytes(4096)
     file.write_bytes(data)
     try:
-        findings = examine(sqlite_url, key)
+        findings = examine(sqlite_url)
     except StoreError as error:
         assert "damaged" in str(error) or "not a SQLite database" in str(error)  # noqa: PT017
         return

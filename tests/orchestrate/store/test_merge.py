@@ -13,7 +13,6 @@ from sqlalchemy import text
 
 from dopt.result import Assessment
 from orchestrate.__main__ import main
-from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import (
     NoDatabaseError,
     Reader,
@@ -75,7 +74,11 @@ def seeds(*numbers: int, policy: str = "random") -> list[Spec]:
 
 
 @each_other
-def test_an_empty_database_becomes_a_copy(url: str, other: str) -> None:
+@pytest.mark.parametrize("steps", [1, 25, source.PAGE_STEPS])
+def test_an_empty_database_becomes_a_copy(
+    url: str, other: str, monkeypatch: pytest.MonkeyPatch, steps: int
+) -> None:
+    monkeypatch.setattr(source, "PAGE_STEPS", steps)
     fill(other, *seeds(*range(9)), Spec(99))
     found = merge(url, other)
     assert found == Merged(added={"done": 5, "diverged": 2, "failed": 2}, launches=1)
@@ -90,16 +93,6 @@ def test_again_changes_nothing(url: str, other: str) -> None:
     again = merge(url, other)
     assert (again.identical, again.kept, again.changed) == (7, 2, False)
     assert everything(url) == before
-
-
-@pytest.mark.parametrize("steps", [1, 25])
-def test_pages_of_few_steps_bring_the_same(
-    url: str, other: str, monkeypatch: pytest.MonkeyPatch, steps: int
-) -> None:
-    monkeypatch.setattr(source, "PAGE_STEPS", steps)
-    fill(other, *seeds(*range(9)), Spec(99))
-    assert merge(url, other).added == {"done": 5, "diverged": 2, "failed": 2}
-    assert everything(url) == outcomes(other)
 
 
 def test_numbers_are_given_again(url: str, other: str) -> None:
@@ -387,7 +380,7 @@ def test_trials_that_contradict_themselves_stay_out(url: str, other: str) -> Non
     numbers = execute(other, "SELECT trial_id FROM trial WHERE seed > 0 ORDER BY seed")
     for (trial_id,), change in zip(numbers, CHANGES.values(), strict=True):
         execute(other, f"UPDATE {change} WHERE trial_id = {trial_id}")
-    found = merge(url, other, trial_key)
+    found = merge(url, other)
     assert (found.added, len(found.contradictory)) == ({"done": 1}, len(CHANGES))
     assert execute(url, "SELECT trial_key FROM trial") == [(Spec(0).trial_key,)]
 

@@ -13,11 +13,10 @@ import pytest
 from sqlalchemy import make_url
 
 from orchestrate.errors import StoreError
-from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.sqlite import is_network, mount_of
+from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store, sqlite
 from orchestrate.store.maintenance import upgrade
 from orchestrate.store.merge import merge
+from orchestrate.store.sqlite import is_network, mount_of
 from orchestrate.store.store import make_backend
 from tests.orchestrate.store.databases import file_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result

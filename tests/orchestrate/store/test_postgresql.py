@@ -21,9 +21,16 @@ import pytest
 from sqlalchemy import Engine, text
 from sqlalchemy.engine import make_url
 
-from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
-from orchestrate.store.backends import base, postgresql, sqlite
-from orchestrate.store.backends.base import is_transient
+from orchestrate.store import (
+    Claim,
+    Reader,
+    Store,
+    StoreUnavailableError,
+    backend,
+    postgresql,
+    sqlite,
+)
+from orchestrate.store.backend import is_transient
 from orchestrate.store.records import Array
 from tests.orchestrate.store.conftest import Database
 from tests.orchestrate.store.databases import execute, file_of, schema_of
@@ -124,7 +131,7 @@ def test_a_sleeper_that_sends_its_steps_is_ended(
             wakes.wait(PATIENCE_SECONDS)
         yield from column.tolist()
 
-    monkeypatch.setattr("orchestrate.store.backends.postgresql.finite_list", asleep)
+    monkeypatch.setattr("orchestrate.store.postgresql.finite_list", asleep)
     with ThreadPoolExecutor(1) as pool:
         committed = pool.submit(late.commit, sent, result(), RUN)
         assert sends.wait(PATIENCE_SECONDS)
@@ -183,7 +190,7 @@ ROW = "SELECT * FROM launch FOR UPDATE"
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Announce a wait after a fraction of the two seconds."""
-    for module in (base, sqlite, postgresql):
+    for module in (backend, sqlite, postgresql):
         monkeypatch.setattr(module, "ANNOUNCE_SECONDS", 0.2)
     monkeypatch.setattr(postgresql, "_WATCH_SECONDS", 0.05)
 

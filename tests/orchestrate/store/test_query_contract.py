@@ -242,18 +242,15 @@ def asked(url: str, statement: str) -> Iterator[tuple[subprocess.Popen[bytes], i
         command.wait()
 
 
-def test_ctrl_c_ends_the_command_and_its_query(sqlite_url: str) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_no_query_outlives_its_command(sqlite_url: str, number: signal.Signals) -> None:
     Store.open(sqlite_url).close()
     with asked(sqlite_url, ONE_CALL) as (command, query):
-        os.killpg(command.pid, signal.SIGINT)  # as a terminal does
-        assert command.wait(PATIENCE_SECONDS) == ExitCode.INTERRUPTED
-        until(lambda: not alive(query))
-
-
-def test_no_query_outlives_its_command(sqlite_url: str) -> None:
-    Store.open(sqlite_url).close()
-    with asked(sqlite_url, ONE_CALL) as (command, query):
-        command.kill()
+        if number == signal.SIGINT:
+            os.killpg(command.pid, number)  # as a terminal does
+            assert command.wait(PATIENCE_SECONDS) == ExitCode.INTERRUPTED
+        else:
+            command.send_signal(number)
         until(lambda: not alive(query))
 
 

@@ -23,13 +23,12 @@ from orchestrate.store import (
     Store,
     StoreError,
     StoreUnavailableError,
+    sqlite,
 )
-from orchestrate.store.backends import sqlite
-from orchestrate.store.backends.sqlite import _is_read_only, read_address
 from orchestrate.store.maintenance import examine
+from orchestrate.store.sqlite import _is_read_only, read_address
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
 from tests.orchestrate.store.processes import (
-    eight_open,
     hear,
     kill,
     run_and_stop,
@@ -80,14 +79,6 @@ def test_curves_are_read_without_a_sort(
     with reader._engine.begin() as connection:
         plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()  # type: ignore[arg-type]
     assert "TEMP B-TREE" not in str(plan)
-
-
-def test_creation_is_safe_many_times_over(tmp_path: Path) -> None:
-    urls = [f"sqlite:///{tmp_path}/{i}.db" for i in range(5)]
-    eight_open(urls)
-    for url in urls:
-        with Store.open(url) as store:
-            assert store.begin_launch(LAUNCH) == 9
 
 
 def test_a_log_that_another_process_deletes_meanwhile_is_not_read_only(

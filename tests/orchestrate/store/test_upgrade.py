@@ -20,9 +20,9 @@ from orchestrate.store import (
     StoreUnavailableError,
 )
 from orchestrate.store import maintenance as migration
-from orchestrate.store.backends.sqlite import LaunchLocks
 from orchestrate.store.maintenance import upgrade
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
+from orchestrate.store.sqlite import LaunchLocks
 from tests.orchestrate.store.conftest import each_version
 from tests.orchestrate.store.databases import (
     backups,
@@ -263,7 +263,7 @@ def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.Mon
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orchestrate.store.backends.base.os.fsync", full)
+    monkeypatch.setattr("orchestrate.store.backend.os.fsync", full)
     with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
         upgrade(sqlite_url)
     assert structure(sqlite_url) == before

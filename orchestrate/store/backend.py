@@ -163,17 +163,11 @@ def is_transient(error: BaseException | None, known_host: bool) -> bool:
     name = getattr(error, "sqlite_errorname", None)
     if name is not None:
         return str(name).startswith(_TRANSIENT_SQLITE)
-    state = getattr(error, "sqlstate", None)
+    state, text = getattr(error, "sqlstate", None), str(error)
     if state is not None:
         return str(state).startswith(_TRANSIENT_STATES)
-    return _is_psycopg_error(error) and _text_is_transient(str(error), known_host)
-
-
-def _is_psycopg_error(error: BaseException | None) -> bool:
-    return type(error).__module__.partition(".")[0] == "psycopg"
-
-
-def _text_is_transient(text: str, known_host: bool) -> bool:
+    if type(error).__module__.partition(".")[0] != "psycopg":
+        return False
     if any(words in text for words in _UNKNOWN_HOST):
         return known_host
     return "FATAL:" not in text or any(words in text for words in _TEMPORARY_REFUSALS)
@@ -315,15 +309,10 @@ def _is_infrastructure(original: BaseException | None) -> bool:
 
 
 def _advice(original: BaseException) -> str:
-    name = getattr(original, "sqlite_errorname", None)
-    if name is None:
-        return _server_advice(original)
-    primary = "_".join(name.split("_")[:2])  # SQLITE_IOERR_WRITE -> SQLITE_IOERR
-    return _SQLITE.get(primary, "SQLite refused; see the reason in brackets")
-
-
-def _server_advice(original: BaseException) -> str:
-    state = getattr(original, "sqlstate", None)
+    name, state = (getattr(original, one, None) for one in ("sqlite_errorname", "sqlstate"))
+    if name is not None:
+        primary = "_".join(name.split("_")[:2])  # SQLITE_IOERR_WRITE -> SQLITE_IOERR
+        return _SQLITE.get(primary, "SQLite refused; see the reason in brackets")
     if state is None:
         return _REFUSED if "FATAL:" in str(original) else _ELSEWHERE
     return next((text for code, text in _STATES.items() if state.startswith(code)), _ELSEWHERE)
@@ -498,18 +487,6 @@ _OF_THE_COPY = {
 """Errors of a copy whose source is opened to be read alone."""
 
 
-@contextmanager
-def _of_the_copy(partial: Path) -> Iterator[None]:
-    """Raise ``OSError`` for an error that the copy, and not its source, has."""
-    try:
-        yield
-    except sqlite3.OperationalError as error:
-        code = _OF_THE_COPY.get(error.sqlite_errorname)
-        if code is None:
-            raise
-        raise OSError(code, os.strerror(code), str(partial)) from error
-
-
 def _free_name(base: str, suffix: str) -> Path:
     names = chain([f"{base}{suffix}"], (f"{base}-{i}{suffix}" for i in count(2)))
     return next(path for path in map(Path, names) if not path.exists())
@@ -530,10 +507,16 @@ def copy_checked(path: Path, partial: Path) -> None:
 
 def _copy_from(source: sqlite3.Connection, partial: Path, path: Path) -> None:
     partial.unlink(missing_ok=True)
-    with _of_the_copy(partial), contextlib.closing(sqlite3.connect(partial)) as copy:
-        source.backup(copy)
-        copy.execute("PRAGMA journal_mode = DELETE")  # one file, complete in itself
-        (verdict,) = copy.execute("PRAGMA quick_check(1)").fetchone()
+    try:
+        with contextlib.closing(sqlite3.connect(partial)) as copy:
+            source.backup(copy)
+            copy.execute("PRAGMA journal_mode = DELETE")  # one file, complete in itself
+            (verdict,) = copy.execute("PRAGMA quick_check(1)").fetchone()
+    except sqlite3.OperationalError as error:
+        code = _OF_THE_COPY.get(error.sqlite_errorname)
+        if code is None:
+            raise
+        raise OSError(code, os.strerror(code), str(partial)) from error
     if verdict != "ok":
         raise StoreUnavailableError(
             f"The results database {path} is damaged ({verdict}): nothing was changed; restore a "

@@ -31,7 +31,7 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
 from orchestrate.errors import StoreError, StoreUnavailableError
-from orchestrate.store.backends.base import (
+from orchestrate.store.backend import (
     ANNOUNCE_SECONDS,
     Backend,
     LaunchLife,
@@ -185,7 +185,12 @@ class PostgreSQLBackend(Backend):
 
     def exclusive(self, connection: Connection) -> None:
         if not connection.execute(_HAS_LOCK).scalar_one():
-            _create_lock(connection)
+            try:  # a transaction that creates it too waits for this one
+                with connection.begin_nested():
+                    connection.execute(_CREATE_LOCK)
+            except DBAPIError as error:
+                if getattr(error.orig, "sqlstate", None) not in _CREATED_BY_ANOTHER:
+                    raise
         connection.execute(_LOCK)
 
     def members(self, keys: Sequence[str]) -> Select[Any]:
@@ -234,16 +239,6 @@ class PostgreSQLBackend(Backend):
 
     def close(self) -> None:
         self.engine.dispose()
-
-
-def _create_lock(connection: Connection) -> None:
-    """Create the table of the lock; a transaction that creates it too waits for this one."""
-    try:
-        with connection.begin_nested():
-            connection.execute(_CREATE_LOCK)
-    except DBAPIError as error:
-        if getattr(error.orig, "sqlstate", None) not in _CREATED_BY_ANOTHER:
-            raise
 
 
 def _end_dead(connection: Connection) -> None:

@@ -44,7 +44,7 @@ from orchestrate.errors import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.backends.base import (
+from orchestrate.store.backend import (
     ANNOUNCE_SECONDS,
     Backend,
     LaunchLife,
@@ -106,8 +106,9 @@ def refuse_unsafe(path: Path, safe_url: str) -> None:
             "results can be lost or damaged, but a disk of this machine is expected: give a file "
             "on one, such as store.url=sqlite:////var/tmp/results.db (in a container a volume, in "
             "WSL a folder of Linux), and copy it afterwards, use PostgreSQL (store=postgresql), "
-            "which many machines share, or let each machine write a share of the grid to its own "
-            f"disk (store=shards). If you know that it is safe, set {SAFE_VARIABLE}={mount.kind}."
+            "which many machines share, or let each machine write some seeds to its own disk "
+            "(docs/example/share.sh). If you know that it is safe, set "
+            f"{SAFE_VARIABLE}={mount.kind}."
         )
 
 
@@ -121,7 +122,9 @@ def mount_of(path: PurePosixPath, table: str) -> Mount | None:
         before, found, after = line.partition(" - ")
         if not found:
             continue
-        mount = Mount(PurePosixPath(_unescaped(before.split(" ")[4])), after.split(" ")[0])
+        # Special characters, such as a space, are octal codes there.
+        folder = re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), before.split(" ")[4])
+        mount = Mount(PurePosixPath(folder), after.split(" ")[0])
         if path.is_relative_to(mount.folder) and (
             holding is None or len(mount.folder.parts) >= len(holding.folder.parts)
         ):
@@ -137,11 +140,6 @@ def is_network(kind: str) -> bool:
     system, _, program = kind.partition(".")
     safe = program in _LOCAL_PROGRAMS if system == "fuse" else kind in _SAFE
     return not safe and kind not in re.split(r"[,\s]+", os.environ.get(SAFE_VARIABLE, ""))
-
-
-def _unescaped(field: str) -> str:
-    r"""Return a field of the table with its octal codes, such as \040, as characters."""
-    return re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), field)
 
 
 LOCK_TABLE = Path("/proc/locks")
@@ -264,14 +262,14 @@ MAX_LOG_BYTES = 16 * 2**20
 def read_engine(url: URL) -> Engine:
     """Return an engine that cannot write; raise ``NoDatabaseError`` if there is no file."""
     path = existing_path(url)
-    return _engine(lambda: _reader(path), _begin)
 
+    def reader() -> sqlite3.Connection:
+        connection = _connect(read_address(path))
+        for name, query in VIEWS.items():  # first: a stranger may have made views of the file
+            connection.execute(f"CREATE TEMP VIEW {name} AS {query}")
+        return connection
 
-def _reader(path: Path) -> sqlite3.Connection:
-    connection = _connect(read_address(path))
-    for name, query in VIEWS.items():  # first: a stranger may have made views of the file
-        connection.execute(f"CREATE TEMP VIEW {name} AS {query}")
-    return connection
+    return _engine(reader, lambda connection: connection.exec_driver_sql("BEGIN"))
 
 
 def existing_path(url: URL) -> Path:
@@ -310,11 +308,7 @@ def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience
     return _engine(connect, begin)
 
 
-def _begin(connection: Connection) -> None:
-    connection.exec_driver_sql("BEGIN")
-
-
-def _engine(connect: Any, begin: Callable[[Connection], None]) -> Engine:
+def _engine(connect: Any, begin: Callable[[Connection], object]) -> Engine:
     engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
     event.listen(engine, "begin", begin)
     return engine

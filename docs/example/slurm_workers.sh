@@ -1,13 +1,16 @@
-# shellcheck shell=bash disable=SC2154 # workers, walltime and leave are set above
+#!/bin/bash
+# Workers of a registered grid, as a job array of SLURM (docs/many_machines.md).
+#SBATCH --job-name=dopt --array=1-8 --nodes=1 --ntasks=1 --cpus-per-task=4 --time=1:00:00
+#SBATCH --open-mode=append --requeue --signal=B:USR1@60
 
 # The number of a task; SLURM_JOB_ID of the last one means the whole array.
 task=${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID
 
-# The task has left before SLURM warns it of its end.
+# The task leaves before SLURM warns it of its end: at most 60 s earlier than it is asked to.
 end=${SLURM_JOB_END_TIME:-$(squeue --noheader --jobs="$task" --format=%e | date --file=- +%s)}
-seconds=$((${end:-$(date +%s) + walltime} - $(date +%s) - leave))
+until=${end:+--until=$((end - $(date +%s) - 120))s}
 
-"${workers[@]}" --until "${seconds}s" &
+python -m orchestrate work --processes="$SLURM_CPUS_PER_TASK" ${until:+"$until"} "$@" &
 pid=$!
 trap 'kill -USR1 "$pid" 2>/dev/null' USR1 TERM
 # A signal ends the wait; the workers end within seconds.

@@ -1,1 +1,0 @@
-"""Database backends: SQLite and PostgreSQL, their connections, locks, errors and backups."""
