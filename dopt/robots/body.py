@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +60,9 @@ class Body:
     """Rigid body of a robot, read from an MJCF or URDF file.
 
     Driven joints are hinges and slides that an actuator moves, or all hinges and slides where the
-    file has no actuators, as in URDF. Other joints stay where the file puts them. Contacts,
-    tendons and equality constraints produce no torque here; :attr:`notes` says what was left out.
+    file has no actuators, as in URDF, except those that a constraint couples to another. Other
+    joints stay where the file puts them. Contacts and constraints produce no torque here;
+    :attr:`notes` says what was left out.
 
     Parameters
     ----------
@@ -82,7 +84,7 @@ class Body:
         import mujoco
 
         log_warnings()
-        self.model, self.source = model, source
+        self.model, self.source = _effective(model), source
         self._ids = _driven_joints(model)
         if not self._ids:
             raise SpecificationError(
@@ -138,6 +140,11 @@ class Body:
         return len(self._ids)
 
     @property
+    def units(self) -> list[str]:
+        """Units of the torques, "N m" or "N"."""
+        return ["N" if kind == SLIDE else "N m" for kind in self.model.jnt_type[self._ids]]
+
+    @property
     def inertial(self) -> Array:
         """Inertial parameters of the moved bodies, (10 · bodies,)."""
         return np.concatenate([self._inertial_of(b) for b in self.moved])
@@ -167,16 +174,20 @@ class Body:
     def torques(self, motion: Motion, regressor: Array | None = None) -> Array:
         """Return the torques that move the body, without friction, (T, n).
 
-        Includes armature and springs of the joints, as the file gives them. The regressor of the
-        motion, where it is known already, saves time.
+        Includes armature, springs, tendons and fluids, as the file gives them. The regressor of
+        the motion, where it is known already, saves time.
         """
+        model = self.model
+        if model.jnt_stiffness.any() or model.ntendon or model.opt.density or model.opt.viscosity:
+            states = zip(motion.positions, motion.velocities, motion.accelerations, strict=True)
+            return np.array([self._known.inverse(*state) for state in states])
         rows = self.regressor(motion) if regressor is None else regressor
-        rigid = rows @ self.inertial
-        stiff = self.model.jnt_stiffness[self._ids]
-        away = motion.positions - self.model.qpos_spring[self.addresses]
-        armature = self.model.dof_armature[self.dofs]
-        result: Array = rigid + armature * motion.accelerations + stiff * away
+        result: Array = rows @ self.inertial + model.dof_armature[self.dofs] * motion.accelerations
         return result
+
+    @functools.cached_property
+    def _known(self) -> KnownBody:
+        return KnownBody(self)
 
     def _frames(self, motion: Motion) -> dict[int, tuple[Array, ...]]:
         """Return rotation, origin, velocity, acceleration and Jacobian of each body, by time.
@@ -256,6 +267,59 @@ class Body:
     @functools.cached_property
     def _contacts(self) -> Contacts:
         return Contacts(self)
+
+
+class KnownBody:
+    """Inverse dynamics of a body at 500 Hz, without friction, contacts and limits.
+
+    Joints that are not driven stay at rest.
+    """
+
+    def __init__(self, body: Body) -> None:
+        import mujoco
+
+        self.body, self.model, self._engine = body, copy.copy(body.model), mujoco
+        self.model.opt.disableflags |= (
+            mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        )
+        self.model.dof_damping[:] = 0.0
+        self.model.dof_frictionloss[:] = 0.0
+        if hasattr(self.model, "dof_dampingpoly"):
+            self.model.dof_dampingpoly[:] = 0.0
+        self._data = mujoco.MjData(self.model)
+        self._unit, self._column = np.zeros(self.model.nv), np.zeros(self.model.nv)
+
+    def inverse(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the torques [N m], (n,), that accelerate the body so."""
+        data, dofs = self._data, self.body.dofs
+        data.qpos[self.body.addresses] = q
+        data.qvel[dofs] = v
+        data.qacc[dofs] = a
+        self._engine.mj_inverse(self.model, data)
+        return np.array(data.qfrc_inverse[dofs])
+
+    def mass_matrix(self) -> Array:
+        """Return M, (n, n), at the position of the last call of :meth:`inverse`."""
+        dofs = self.body.dofs
+        M = np.empty((len(dofs), len(dofs)))
+        for k, dof in enumerate(dofs):
+            self._unit[dof] = 1.0
+            self._engine.mj_mulM(self.model, self._data, self._column, self._unit)
+            self._unit[dof] = 0.0
+            M[k] = self._column[dofs]
+        return M
+
+    def hang(self, mass: float, moment: Array) -> None:
+        """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
+        model, last = self.model, self.body.moved[-1]
+        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
+        total = own + mass
+        model.body_mass[last] = total
+        model.body_ipos[last] = (own * centre + moment) / total
+        if mass > 0.0:
+            away = moment / mass - centre
+            model.body_inertia[last] += own * mass / total * (away @ away)
+        self._engine.mj_setConst(model, self._data)
 
 
 class Contacts:
@@ -402,13 +466,45 @@ def rotation(quaternion: Array) -> Array:
     return result
 
 
+def _effective(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy whose joints have what its flags and actuators change.
+
+    Without gravity where it is disabled, and with the armature and the damping of actuators.
+    Gravity that actuators compensate is a part of their torques.
+    """
+    import mujoco
+
+    model = copy.copy(model)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        model.opt.gravity[:] = 0.0
+    if model.jnt_actgravcomp.any():
+        model.body_gravcomp[:] = 0.0
+    for a, j, gear, _ in actuators(model) if hasattr(model, "actuator_armature") else ():
+        dof = model.jnt_dofadr[j]
+        model.dof_armature[dof] += gear**2 * model.actuator_armature[a]
+        model.dof_damping[dof] += gear**2 * model.actuator_damping[a]
+        model.actuator_armature[a] = model.actuator_damping[a] = 0.0
+    return model
+
+
+def actuators(model: mujoco.MjModel) -> Iterator[tuple[int, int, float, int]]:
+    """Yield the actuators of hinges and slides: number, joint, gear and place of its control."""
+    controls, outputs = (getattr(model, f"actuator_{kind}adr", None) for kind in ("ctrl", "out"))
+    for a, (target, _) in enumerate(model.actuator_trnid):
+        of_joint = model.actuator_trntype[a] in (0, 1)  # of a joint, or in its parent's frame
+        if of_joint and model.jnt_type[target] in (HINGE, SLIDE):
+            gear = float(model.actuator_gear[a if outputs is None else outputs[a], 0])
+            yield a, int(target), gear, a if controls is None else int(controls[a])
+
+
 def _driven_joints(model: mujoco.MjModel) -> list[int]:
+    import mujoco
+
+    by_joint = {j for _, j, _, _ in actuators(model)}
+    coupled = model.eq_obj1id[(model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0]
     free = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
-    if not model.nu:
-        return free
-    of_joints = np.isin(model.actuator_trntype, (0, 1))  # of a joint, or in its parent's frame
-    by_joint = {int(j) for j in model.actuator_trnid[of_joints, 0]}
-    return [j for j in free if j in by_joint] or free
+    return sorted(by_joint) or [j for j in free if j not in coupled]
 
 
 def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
@@ -421,19 +517,51 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
 
 
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
-    held = model.njnt - len(ids)
+    import mujoco
+
+    kinds, single = mujoco.mjtObj, {a for a, *_ in actuators(model)}
+    numbers = np.arange(model.njnt)
+    kinked = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1))).any(axis=1)
     left = {
-        f"joints without an actuator, which stay where the file puts them: {held}": held,
-        f"tendons that are left out: {model.ntendon}": model.ntendon,
-        f"equality constraints that are left out: {model.neq}": model.neq,
+        "joints that stay where the file puts them": (
+            kinds.mjOBJ_JOINT,
+            np.setdiff1d(numbers, ids),
+        ),
+        "actuators that move no hinge or slide alone, which are left out": (
+            kinds.mjOBJ_ACTUATOR,
+            [a for a in range(len(model.actuator_trntype)) if a not in single],
+        ),
+        "equality constraints that are left out": (kinds.mjOBJ_EQUALITY, range(model.neq)),
+        "tendons whose dry friction is left out": (
+            kinds.mjOBJ_TENDON,
+            np.flatnonzero(model.tendon_frictionloss),
+        ),
+        "joints whose compensation of gravity is left out": (
+            kinds.mjOBJ_JOINT,
+            [j for j in ids if model.jnt_actgravcomp.any() > model.jnt_actgravcomp[j]],
+        ),
+        "joints whose damping of higher order is left out": (
+            kinds.mjOBJ_JOINT,
+            np.unique(model.dof_jntid[kinked]),
+        ),
     }
-    return [text for text, count in left.items() if count]
+    return [
+        f"{text}: {listed([_name(model, kind, i) for i in which])}"
+        for text, (kind, which) in left.items()
+        if len(which)
+    ]
+
+
+def listed(names: list[str]) -> str:
+    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _name(model: mujoco.MjModel, kind: Any, i: int) -> str:
     import mujoco
 
-    return mujoco.mj_id2name(model, kind, int(i)) or f"{kind.name[6:].lower()}{i}"
+    name = mujoco.mj_id2name(model, kind, int(i)) or f"{kind.name[6:].lower()}{i}"
+    free = kind == mujoco.mjtObj.mjOBJ_JOINT and model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE
+    return f"{name} (free)" if free else name
 
 
 def without_meshes(source: Path) -> mujoco.MjSpec:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dopt.errors import SpecificationError, given_path, unknown_name
-from dopt.robots.body import Body, Motion
+from dopt.robots.body import Body, Motion, actuators, listed
 from dopt.types import Array
 
 KINDS = ("position", "velocity", "acceleration", "torque")
@@ -25,7 +25,13 @@ FAST, STRONG = 2.0 * math.pi, 300.0
 """Velocity [rad/s] and torque [N m] from which equal limits of all joints look like defaults."""
 
 WIDE = 1e3
-"""Limits of this size are none."""
+"""Torques of this size in a robot's file are none."""
+
+POSES = 1000
+"""Random positions in which a robot's weight is compared with its limits of torque."""
+
+INTEGRATOR = 1
+"""Dynamics of an actuator, whose control is a rate of its force."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +91,7 @@ class Limits:
         notes = [*_suspicious(body, arrays, given)]
         if assumed:
             notes.append(
-                f"no acceleration is given for {_listed(assumed)}: the velocity in {STOPPING:g} s "
+                f"no acceleration is given for {listed(assumed)}: the velocity in {STOPPING:g} s "
                 f"is assumed"
             )
         return cls(**arrays, notes=tuple(notes))
@@ -112,10 +118,27 @@ class Limits:
         return {kind: float(np.abs(part).max()) for kind, part in parts.items()}
 
 
+def check_weight(body: Body, limits: Limits) -> None:
+    """Refuse limits of torque that hold the body at rest in none of many random positions."""
+    low, high = limits.position.T
+    q = low + (high - low) * np.random.default_rng(0).random((POSES, body.n))
+    weights = np.abs(body.torques(Motion(1.0, q, *np.zeros((2, *q.shape)))))
+    shares = weights / limits.torque
+    best = int(shares.max(axis=1).argmin())
+    k = int(shares[best].argmax())
+    if shares[best, k] > 1.0:
+        unit = body.units[k]
+        raise SpecificationError(
+            f"joint '{body.joints[k]}' takes {weights[best, k]:.3g} {unit} at rest, in the best of "
+            f"{POSES} random positions, but its limit of torque is {limits.torque[k]:g} {unit}: "
+            f"give a larger limit, or ranges of position in which it carries less."
+        )
+
+
 def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> SpecificationError:
     """Return the error for limits that no file gives, with the lines that are to be filled in."""
     lacking = {kind: names for kind, names in missing.items() if names}
-    said = "; ".join(f"{kind} of {_listed(list(names))}" for kind, names in lacking.items())
+    said = "; ".join(f"{kind} of {listed(list(names))}" for kind, names in lacking.items())
     every = {kind for kind, names in lacking.items() if len(names) == body.n}
     lines = ["joints:"]
     for name in ("default", *body.joints):
@@ -124,21 +147,23 @@ def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> Specificatio
             blanks = [f"{k}: {'[…, …]' if k == 'position' else '…'}" for k in KINDS if k in kinds]
             lines.append(f"  {name}: {{{', '.join(blanks)}}}")
     return SpecificationError(
-        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N): "
-        f"{said}. Fill in these lines, and give them as a file of limits (--limits FILE):\n"
-        + "\n".join(lines)
+        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N; "
+        f"{WIDE:g} or more in the robot's file is none): {said}. Fill in these lines, and give "
+        f"them as a file of limits (--limits FILE):\n" + "\n".join(lines)
     )
 
 
 def _own(body: Body) -> dict[str, list[Any]]:
     """Return the limits in the robot's own file; None where it has none."""
-    model, ids = body.model, [body.model.joint(name).id for name in body.joints]
-    own: dict[str, list[Any]] = {kind: [None] * body.n for kind in KINDS}
-    for k, j in enumerate(ids):
-        if model.jnt_limited[j]:
-            own["position"][k] = [float(x) for x in model.jnt_range[j]]
-        torque = _torque(body, j)
-        own["torque"][k] = torque if 0.0 < torque < WIDE else None
+    model, ids, torques = body.model, body.model.dof_jntid[body.dofs], _torques(body)
+    own: dict[str, list[Any]] = {
+        "position": [
+            list(map(float, model.jnt_range[j])) if model.jnt_limited[j] else None for j in ids
+        ],
+        "velocity": [None] * body.n,
+        "acceleration": [None] * body.n,
+        "torque": [torques[j] if 0.0 < torques[j] < WIDE else None for j in ids],
+    }
     if body.source is not None and body.source.suffix == ".urdf":
         for joint in Xml.parse(body.source).getroot().iter("joint"):
             limit, name = joint.find("limit"), joint.get("name")
@@ -147,19 +172,22 @@ def _own(body: Body) -> dict[str, list[Any]]:
     return own
 
 
-def _torque(body: Body, j: int) -> float:
-    """Return the largest torque of a joint by its own range and its actuators."""
-    model, found = body.model, math.inf
-    if model.jnt_actfrclimited[j]:
-        found = float(np.abs(model.jnt_actfrcrange[j]).min())
-    for a in range(model.nu):
-        if int(model.actuator_trntype[a]) in (0, 1) and int(model.actuator_trnid[a, 0]) == j:
-            gear = abs(float(model.actuator_gear[a, 0]))
-            if model.actuator_forcelimited[a]:
-                found = min(found, gear * float(np.abs(model.actuator_forcerange[a]).min()))
-            elif model.actuator_ctrllimited[a] and not model.actuator_biastype[a]:
-                gain = gear * abs(float(model.actuator_gainprm[a, 0]))
-                found = min(found, gain * float(np.abs(model.actuator_ctrlrange[a]).min()))
+def _torques(body: Body) -> Array:
+    """Return the largest torque of every joint by its own range and its actuators."""
+    model = body.model
+    own = np.abs(model.jnt_actfrcrange).min(axis=1)
+    found: Array = np.where(model.jnt_actfrclimited, own, math.inf)
+    for a, j, gear, control in actuators(model):
+        if model.actuator_forcelimited[a]:
+            found[j] = min(found[j], abs(gear) * np.abs(model.actuator_forcerange[a]).min())
+        plain = (model.actuator_gaintype[a], model.actuator_biastype[a]) == (0, 0)
+        if (
+            plain
+            and model.actuator_dyntype[a] != INTEGRATOR
+            and model.actuator_ctrllimited[control]
+        ):
+            gain = abs(gear * model.actuator_gainprm[a, 0])
+            found[j] = min(found[j], gain * np.abs(model.actuator_ctrlrange[control]).min())
     return found
 
 
@@ -234,12 +262,8 @@ def _suspicious(
         n for n, r in zip(body.joints, limits["position"], strict=True) if np.ptp(r) > 4 * np.pi
     ]
     if wide:
-        found.append(f"the range of {_listed(wide)} is more than two turns: check it")
+        found.append(f"the range of {listed(wide)} is more than two turns: check it")
     return found
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more joints"
 
 
 def _unlike(source: Path, what: str, value: object, expected: str) -> SpecificationError:

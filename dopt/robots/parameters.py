@@ -246,8 +246,7 @@ class Unknowns:
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
             friction += model.dof_frictionloss[body.dofs] * self._signs(motion)
-            torques = rows @ body.inertial + friction
-            torques += model.dof_armature[body.dofs] * motion.accelerations
+            torques = body.torques(motion, rows) + friction
         for i, one in enumerate(self.parameters):
             if one.kind not in OF_JOINTS:
                 continue

@@ -95,7 +95,16 @@ def _measured(body: Body, dt: float) -> Any:
     for part in [*spec.keys, *spec.actuators, *spec.sensors]:
         spec.delete(part)
     spec.option.timestep = dt
-    for joint in body.joints:
+    # What :class:`Body` moved to the joints, from flags and actuators.
+    if body.model.jnt_actgravcomp.any():
+        for part in spec.bodies:
+            part.gravcomp = 0.0
+    for part in spec.joints:
+        part.name = part.name or f"joint{part.id}"
+    for joint, dof in zip(body.joints, body.dofs, strict=True):
+        part, linear = spec.joint(joint), body.model.dof_damping[dof]
+        part.armature = body.model.dof_armature[dof]
+        part.damping = [linear, *part.damping[1:]] if np.ndim(part.damping) else linear
         motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
         spec.add_sensor(

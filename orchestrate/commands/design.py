@@ -120,6 +120,8 @@ def _check(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]
 
     best = multisine(problem, np.random.default_rng(arguments.seed))
     document = head | _told(problem, best.motion(1.0 / arguments.rate), best.errors)
+    if obstacle := problem.obstacle(best):
+        document["notes"].append(f"the best multisine breaks limits: {obstacle}")
     how = f"by the best of {document['motions']} random multisines of {problem.seconds:g} s"
     return answer(arguments, document, "\n".join([*_said(document), *_expected(document, how)]))
 
@@ -163,7 +165,11 @@ def _listed(items: list[str], what: str) -> list[str]:
     if not items:
         return [f"no {what}"]
     more = [f"  and {len(items) - SHOWN} more (--json)"] if len(items) > SHOWN else []
-    return [f"{len(items)} {what}:", *(f"  {item}" for item in items[:SHOWN]), *more]
+    return [
+        f"{len(items)} {what if len(items) > 1 else what.replace('s ', ' ', 1)}:",
+        *(f"  {item}" for item in items[:SHOWN]),
+        *more,
+    ]
 
 
 def _expected(document: dict[str, Any], how: str) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, Motion
-from dopt.robots.limits import Limits
+from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Identifiability, Unknowns, relative_errors
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
@@ -101,7 +101,7 @@ def inverse(body: Body, motion: Motion, model: object = None) -> np.ndarray:
 def test_torques_are_those_of_the_engine(arm: Body) -> None:
     assert arm.joints == ("turn", "slide", "lift", "roll")
     assert arm.bodies == ("base", "link", "hand")
-    assert "joints without an actuator, which stay where the file puts them: 1" in arm.notes
+    assert arm.notes == ("joints that stay where the file puts them: joint4 (free)",)
     for body in (arm, jaco()):
         damping = body.model.dof_damping.copy()
         motion = random_motion(body.n)
@@ -110,6 +110,45 @@ def test_torques_are_those_of_the_engine(arm: Body) -> None:
         body.model.dof_damping[:] = damping
         scale = np.abs(expected).max()
         np.testing.assert_allclose(body.torques(motion), expected, atol=1e-12 * scale)
+
+
+TWO = """
+<mujoco><option %s</option><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0" %s/>
+<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.04" mass="3" fluidshape="ellipsoid"/>
+<body name="b" pos="0.4 0 0" gravcomp="0.7"><joint name="b" axis="0 1 0.2" %s/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="2"/></body></body></worldbody>
+<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed></tendon>
+<actuator><motor joint="a" gear="2" %s/><motor joint="b"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ('><flag gravity="disable"/>', "", "", ""),
+        ('><flag invdiscrete="enable"/>', 'armature="0.2"', "", ""),
+        ('density="1000" viscosity="3">', "", "", ""),
+        (">", 'actuatorgravcomp="true"', 'actuatorgravcomp="true"', ""),
+        (">", 'stiffness="4"', 'stiffness="3" springref="20" ref="10"', ""),
+        ('><flag spring="disable"/>', 'stiffness="4"', "", ""),
+        (">", 'damping="0.2 0.3" frictionloss="0.4"', 'damping="2"', ""),
+        (">", 'armature="0.1"', "", 'armature="0.3" damping="0.4"'),
+    ],
+)
+def test_torques_know_what_a_file_switches_off_and_adds(parts: tuple[str, ...]) -> None:
+    """The engine's, less what the same model without damping lacks."""
+    try:
+        raw = mujoco.MjModel.from_xml_string(TWO % parts)
+    except ValueError as error:  # actuators' armature, and damping of higher order
+        pytest.skip(f"needs a newer MuJoCo: {error}")
+    for name in ("dof_damping", "dof_dampingpoly", "actuator_damping"):
+        if hasattr(raw, name):
+            getattr(raw, name)[:] = 0.0
+    raw.opt.enableflags = 0
+    body, motion = body_of(TWO % parts), random_motion(2)
+    expected = inverse(body, motion, raw)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(body.torques(motion), expected, atol=1e-12 * scale)
 
 
 @pytest.mark.parametrize("name", ["mass", "com", "inertia", "armature", "damping"])
@@ -253,7 +292,7 @@ def test_limits_that_are_wrong_are_named(arm: Body, tmp_path: Path, text: str, s
 
 
 def test_missing_limits_are_named_at_once_with_the_lines_to_fill_in(arm: Body) -> None:
-    with pytest.raises(SpecificationError, match="velocity of turn and 3 more joints") as error:
+    with pytest.raises(SpecificationError, match="velocity of turn and 3 more\\. Fill") as error:
         Limits.of(arm)
     lines = str(error.value).partition("\n")[2]
     assert lines == "joints:\n  default: {velocity: …}"
@@ -343,3 +382,76 @@ except SpecificationError as error:
     command = [sys.executable, "-c", text, tmp_path / "arm.xml"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout
+
+
+def test_what_is_left_out_is_named() -> None:
+    body = body_of(
+        """<mujoco><worldbody><body><freejoint name="root"/><geom size="0.1"/>
+        <body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+        <body><joint name="b" axis="0 1 0"/><geom size="0.1"/>
+        <body><joint name="c" type="ball"/><geom size="0.1"/>
+        </body></body></body></body></worldbody>
+        <tendon><fixed name="rope" frictionloss="1"><joint joint="b" coef="1"/></fixed></tendon>
+        <equality><joint name="mimic" joint1="b" joint2="a"/></equality>
+        <actuator><motor joint="a"/><motor name="pull" tendon="rope"/></actuator></mujoco>"""
+    )
+    assert body.joints == ("a",)
+    assert body.notes == (
+        "joints that stay where the file puts them: root (free), b, c",
+        "actuators that move no hinge or slide alone, which are left out: pull",
+        "equality constraints that are left out: mimic",
+        "tendons whose dry friction is left out: rope",
+    )
+
+
+def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:
+    joint = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{0}"/>
+      <axis xyz="0 1 0"/><limit lower="0" upper="0.04" effort="20" velocity="0.2"/>{2}</joint>"""
+    link = """<link name="{0}"><inertial><mass value="0.1"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+    links = "".join(link.format(name) for name in ("hand", "left", "right"))
+    mimic = joint.format("right", "hand", '<mimic joint="left" multiplier="-1"/>')
+    (tmp_path / "gripper.urdf").write_text(
+        f'<robot name="r">{links}{joint.format("left", "hand", "")}{mimic}</robot>'
+    )
+    body = Body.load(tmp_path / "gripper.urdf")
+    assert body.joints == ("left",)
+    assert body.notes[0] == "joints that stay where the file puts them: right"
+    limits = Limits.of(body)
+    assert (limits.torque, limits.velocity) == ([20.0], [0.2])
+
+
+def test_limits_of_joints_without_names_and_of_actuators_with_two_limits(tmp_path: Path) -> None:
+    """A joint's torque is what its control, its force and the joint itself allow, all of them."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint/><geom size="0.1"/>
+        <body><joint name="b"/><geom size="0.1"/>
+        <body><joint name="c" actuatorfrcrange="-5 5"/><geom size="0.1"/></body></body></body>
+        </worldbody><actuator><motor joint="b" gear="50" ctrlrange="-1 1" forcerange="-100 100"/>
+        <position joint="c" kp="9" forcerange="-2 2" gear="2" ctrlrange="-1 1"/></actuator>
+        </mujoco>"""
+    )
+    given = "joints: {default: {position: 1, velocity: 2}}"
+    np.testing.assert_array_equal(limits_of(body, tmp_path, given).torque, [50.0, 4.0])
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint/><geom size="0.1"/></body></worldbody></mujoco>"""
+    )
+    found = limits_of(Body(model), tmp_path, given.replace("2", "2, torque: 3"))
+    assert Body(model).joints == ("joint0",)
+    assert found.torque == [3.0]
+
+
+def test_a_joint_that_cannot_carry_its_weight_is_named(tmp_path: Path) -> None:
+    body = body_of(
+        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" range="0 1"/>
+        <geom size="0.1" mass="6"/><body><joint name="arm" axis="0 1 0" range="70 115"/>
+        <geom size="0.1" pos="0 0 1" mass="3"/></body></body></worldbody></mujoco>"""
+    )
+    given = "joints: {default: {velocity: 1}, arm: {torque: %s}, z: {torque: %s}}"
+    for arm, slide, said in (
+        (99, 80, "'z' takes 88.3 N at rest.*limit of torque is 80 N"),
+        (20, 99, "'arm' takes 26.* N m at rest.*limit of torque is 20 N m: give"),
+    ):
+        with pytest.raises(SpecificationError, match=said):
+            check_weight(body, limits_of(body, tmp_path, given % (arm, slide)))
+    check_weight(body, limits_of(body, tmp_path, given % (29, 99)))

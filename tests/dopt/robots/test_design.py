@@ -226,3 +226,23 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
     ):
         with pytest.raises(SpecificationError, match=said):
             sequences(body, broken)
+
+
+def test_what_stands_against_every_motion_is_named(tmp_path: Path) -> None:
+    """A slide holds its weight at rest, and not while it moves against friction; and a wall."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" range="0 1"
+        frictionloss="20"/><geom size="0.1" mass="6"/></body></worldbody></mujoco>"""
+    )
+    limits = limits_of(body, tmp_path, "joints: {z: {velocity: 1, torque: 70}}")
+    problem = Problem(body, limits, "damping", 3.0, nuisance="")
+    with pytest.raises(
+        SpecificationError, match=r"in the best one, joint 'z' takes [0-9.]+ of 70 N\)"
+    ):
+        Design.of(problem, effort=24)
+    fold = body_of(FOLD)
+    given = "joints: {hinge: {position: [1.0, 1.5], velocity: 1, torque: 70}}"
+    problem = Problem(fold, limits_of(fold, tmp_path, given), "damping", 3.0)
+    assert problem.obstacle(multisine(problem, np.random.default_rng(0))) == (
+        "the bodies world and arm touch"
+    )

@@ -1,5 +1,6 @@
 """Explorer of robots with a known body: limits, stops, payloads, and bad measurements."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -295,3 +296,10 @@ def test_bad_arguments_are_refused_with_a_remedy() -> None:
         explorer.ask(np.full(3, np.nan))
     with pytest.raises(SpecificationError, match="3 real numbers"):
         explorer.ask(np.zeros(2))
+
+
+def test_a_robot_that_its_torques_hardly_carry_is_refused() -> None:
+    body, limits = small()
+    weak = dataclasses.replace(limits, torque=0.01 * limits.torque)
+    with pytest.raises(SpecificationError, match="more than 70 % of its limit of torque at rest"):
+        RobotExplorer(body, weak)
