@@ -24,6 +24,9 @@ from dopt.types import Array
 if TYPE_CHECKING:
     import mujoco
 
+BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia="1e-6"/></mujoco>'
+"""What an URDF needs whose inertias are those of no body."""
+
 INERTIAL = 10
 """Inertial parameters of a body: m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about its origin."""
 
@@ -128,9 +131,10 @@ class Body:
                 model = without_meshes(source).compile()
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
+            remedy = f"put {BOUNDS} into its <robot>" if "inertia" in text else "correct it"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
-                f"correct it."
+                f"{remedy}."
             ) from error
         return cls(model, source)
 

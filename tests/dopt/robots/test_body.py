@@ -324,11 +324,17 @@ def test_wrong_parameters_are_named(arm: Body, limits: Limits, wanted: str, said
         Unknowns(arm, limits, wanted)
 
 
+FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>
+<link name="b"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="3" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("<mujoco><worldbody/></mujoco>", "no hinge or slide"),
         ("<mujoco><worldbody>", "cannot be read"),
+        ('<robot name="r"><link name="a"/>%s</robot>' % FLAT, "put <mujoco><compiler balance"),
         ("", "robot.xml"),
     ],
 )
