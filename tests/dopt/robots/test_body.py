@@ -334,7 +334,7 @@ FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/><
     [
         ("<mujoco><worldbody/></mujoco>", "no hinge or slide"),
         ("<mujoco><worldbody>", "cannot be read"),
-        ('<robot name="r"><link name="a"/>%s</robot>' % FLAT, "put <mujoco><compiler balance"),
+        (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
         ("", "robot.xml"),
     ],
 )
