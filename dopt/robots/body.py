@@ -79,8 +79,6 @@ class Body:
         Names of the n driven joints.
     bodies : tuple of str
         Names of the bodies that a driven joint moves.
-    notes : tuple of str
-        What the model holds and the torques leave out.
     """
 
     def __init__(self, model: mujoco.MjModel, source: Path | None = None) -> None:
@@ -100,7 +98,6 @@ class Body:
         self._paths = _paths(model, self._ids)
         self.moved = tuple(b for b in range(1, model.nbody) if self._paths[b])
         self.bodies = tuple(_name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in self.moved)
-        self.notes = tuple(_left_out(model, self._ids))
 
     @classmethod
     def load(cls, file: str | Path) -> Body:
@@ -138,6 +135,11 @@ class Body:
             ) from error
         return cls(model, source)
 
+    @functools.cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What the model holds and the torques, or searches for collisions, leave out."""
+        return (*_left_out(self.model, self._ids), *self._contacts.left_out())
+
     @property
     def n(self) -> int:
         """Number of driven joints."""
@@ -155,9 +157,15 @@ class Body:
 
     @property
     def home(self) -> Array:
-        """Positions of the driven joints in the file, or in its first keyframe, (n,)."""
-        positions = self.model.key_qpos[0] if self.model.nkey else self.model.qpos0
-        return np.array(positions[self.addresses])
+        """Positions of the driven joints in the file, or in its first keyframe, (n,).
+
+        A joint that is out of its range there is in the middle of it.
+        """
+        model = self.model
+        positions = (model.key_qpos[0] if model.nkey else model.qpos0)[self.addresses]
+        low, high = model.jnt_range[self._ids].T
+        outside = model.jnt_limited[self._ids] & ((positions < low) | (positions > high))
+        return np.where(outside, (low + high) / 2.0, positions)
 
     def _inertial_of(self, b: int) -> Array:
         model = self.model
@@ -364,6 +372,17 @@ class Contacts:
         self._engine.mj_collision(self._model, data)
         contact = data.contact
         return self._model.geom_bodyid[contact.geom], np.array(contact.dist)
+
+    def left_out(self) -> list[str]:
+        """Name the bodies that touch at home, of which contacts are not counted."""
+        pairs = {tuple(sorted(pair)) for pair in self._pass(self._body.home)[0].tolist()}
+        touching = [
+            " and ".join(_name(self._model, self._engine.mjtObj.mjOBJ_BODY, b) for b in pair)
+            for pair in sorted(pairs)
+            if set(pair) & set(self._body.moved)
+        ]
+        text = "bodies that touch where the file puts them, whose contacts are allowed"
+        return [f"{text}: {listed(touching)}"] if touching else []
 
     def near(self, positions: Array) -> set[tuple[int, int]]:
         """Return the pairs that the engine finds in contact at positions, (n,)."""

@@ -20,6 +20,9 @@ CORRECTION = 0.5, 0.1
 APART, SEEN = 0.01, 0.03
 """Distance that bodies keep, for errors of tracking, and from which they are looked at [m]."""
 
+SAME = 1e-8
+"""Distance by which bodies that a joint moves together come nearer by rounding alone [m]."""
+
 BRAKING = np.array([[0.25], [0.5], [0.75], [1.0]])
 """Parts of the time of braking after which contacts are looked for."""
 
@@ -121,14 +124,14 @@ class Guard:
         moved = np.abs(poses - self._poses) @ self._levers
         for k in np.flatnonzero(moved >= self._room):
             room = self._contacts.room(poses[k])
-            if room < 0.0 and room < self._contacts.room(now):
+            if room < 0.0 and room < self._contacts.room(now) - SAME:
                 return False
             self._poses[k], self._room[k] = poses[k], room
         return True
 
     def open(self, q: Array, j: int) -> tuple[bool, bool]:
         """Return whether joint j may move down, and up, from a position, (n,)."""
-        least = min(0.0, self._contacts.room(q))
+        least = min(0.0, self._contacts.room(q)) - SAME
         below, above = (self._contacts.room(q + way * self._step[j]) for way in (-1.0, 1.0))
         return below >= least, above >= least
 

@@ -355,6 +355,23 @@ def test_collisions_are_found_and_contacts_at_home_are_not() -> None:
     assert touching == [(1, "world", "arm")]  # the axis turns it down
 
 
+def test_home_is_within_the_ranges_and_what_touches_there_is_named() -> None:
+    """At 0, out of its range, the forearm is in the base; in the middle of the range it is not."""
+    text = """<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1"/>
+        <body pos="0 0 0.3"><joint axis="0 1 0" range="-90 90"/>
+        <geom size="0.02"/><body name="fore"><joint axis="0 1 0" range="{}"/>
+        <geom type="capsule" fromto="0 0 -0.2 0 0 -0.4" size="0.02"/></body></body></worldbody>
+        </mujoco>"""
+    away, within = body_of(text.format("90 270")), body_of(text.format("-90 90"))
+    np.testing.assert_allclose(away.home, [0.0, np.pi])
+    assert away.notes == ()
+    assert [pair for _, *pair in away.collisions(np.zeros((1, 2)))] == [["world", "fore"]]
+    assert within.notes == (
+        "bodies that touch where the file puts them, whose contacts are allowed: world and fore",
+    )
+    assert within.collisions(np.zeros((1, 2))) == []
+
+
 def test_room_is_the_distance_beyond_the_one_to_keep() -> None:
     body = body_of(
         """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
@@ -392,7 +409,8 @@ except SpecificationError as error:
 
 def test_what_is_left_out_is_named() -> None:
     body = body_of(
-        """<mujoco><worldbody><body><freejoint name="root"/><geom size="0.1"/>
+        """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
+        <body><freejoint name="root"/><geom size="0.1"/>
         <body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
         <body><joint name="b" axis="0 1 0"/><geom size="0.1"/>
         <body><joint name="c" type="ball"/><geom size="0.1"/>
