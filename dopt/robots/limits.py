@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import xml.etree.ElementTree as Xml
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,7 @@ class Limits:
         if any(missing.values()):
             raise _missing(body, missing)
         arrays = {kind: np.array(value, dtype=float) for kind, value in values.items()}
-        notes = [*_suspicious(body, arrays, given)]
+        notes = [*_suspicious(body, arrays, given), *_beyond(body, arrays, own)]
         if assumed:
             notes.append(
                 f"no acceleration is given for {listed(assumed)}: the velocity in {STOPPING:g} s "
@@ -155,21 +155,28 @@ def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> Specificatio
 
 def _own(body: Body) -> dict[str, list[Any]]:
     """Return the limits in the robot's own file; None where it has none."""
-    model, ids, torques = body.model, body.model.dof_jntid[body.dofs], _torques(body)
-    own: dict[str, list[Any]] = {
-        "position": [
-            list(map(float, model.jnt_range[j])) if model.jnt_limited[j] else None for j in ids
-        ],
-        "velocity": [None] * body.n,
+    model, torques, velocities = body.model, _torques(body), _velocities(body.source)
+    ids = model.dof_jntid[body.dofs]
+    return {
+        "position": [model.jnt_range[j].tolist() if model.jnt_limited[j] else None for j in ids],
+        "velocity": [velocities.get(name) for name in body.joints],
         "acceleration": [None] * body.n,
         "torque": [torques[j] if 0.0 < torques[j] < WIDE else None for j in ids],
     }
-    if body.source is not None and body.source.suffix == ".urdf":
-        for joint in Xml.parse(body.source).getroot().iter("joint"):
-            limit, name = joint.find("limit"), joint.get("name")
-            if limit is not None and name in body.joints and "velocity" in limit.keys():  # noqa: SIM118  # an element, no mapping
-                own["velocity"][body.joints.index(name)] = float(limit.get("velocity", 0.0)) or None
-    return own
+
+
+def _velocities(source: Path | None) -> dict[str | None, float | None]:
+    """Return the limits of velocity in an URDF, by its joints."""
+    try:
+        joints = Xml.fromstring(source.read_bytes().strip()).iter("joint") if source else ()
+    except Xml.ParseError:  # of a prefix that is not declared, which the engine lets pass
+        return {}
+    limits = ((joint.get("name"), joint.find("limit")) for joint in joints)
+    return {
+        name: float(limit.get("velocity", 0.0)) or None
+        for name, limit in limits
+        if limit is not None
+    }
 
 
 def _torques(body: Body) -> Array:
@@ -264,6 +271,19 @@ def _suspicious(
     if wide:
         found.append(f"the range of {listed(wide)} is more than two turns: check it")
     return found
+
+
+def _beyond(body: Body, limits: Mapping[str, Array], own: Mapping[str, list[Any]]) -> Iterator[str]:
+    """Yield a sentence for each kind of limit that is beyond the one in the robot's file."""
+    for kind in KINDS:
+        names = [
+            name
+            for name, given, limit in zip(body.joints, limits[kind], own[kind], strict=True)
+            if limit is not None
+            and (np.max(given) > np.max(limit) or kind == "position" and given[0] < limit[0])
+        ]
+        if names:
+            yield f"the {kind} of {listed(names)} goes beyond the robot's file: check it"
 
 
 def _unlike(source: Path, what: str, value: object, expected: str) -> SpecificationError:

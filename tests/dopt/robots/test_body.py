@@ -255,6 +255,14 @@ def test_limits_come_from_the_file_then_the_robot(limits: Limits) -> None:
     np.testing.assert_allclose(limits.position[1], [-0.3, 0.3])
 
 
+def test_limits_beyond_the_file_are_said(arm: Body, tmp_path: Path) -> None:
+    wide = "turn: {position: [-2.1, 2]}, slide: {position: 0.3, torque: 61}, lift: {torque: 9}"
+    assert limits_of(arm, tmp_path, f"joints: {{default: {{velocity: 2}}, {wide}}}").notes[:2] == (
+        "the position of turn goes beyond the robot's file: check it",
+        "the torque of slide goes beyond the robot's file: check it",
+    )
+
+
 def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
     joints = "".join(
         f"""<link name="l{i + 1}"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1"
@@ -443,6 +451,12 @@ def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:
     assert body.notes[0] == "joints that stay where the file puts them: right"
     limits = Limits.of(body)
     assert (limits.torque, limits.velocity) == ([20.0], [0.2])
+    text = (tmp_path / "gripper.urdf").read_text()
+    (tmp_path / "gripper.urdf").write_text(f'\n<?xml version="1.0"?>{text}')
+    assert Limits.of(Body.load(tmp_path / "gripper.urdf")).velocity == [0.2]
+    (tmp_path / "gripper.urdf").write_text(text.replace("</robot>", "<a:b/></robot>"))
+    with pytest.raises(SpecificationError, match="velocity of left"):
+        Limits.of(Body.load(tmp_path / "gripper.urdf"))
 
 
 def test_limits_of_joints_without_names_and_of_actuators_with_two_limits(tmp_path: Path) -> None:
