@@ -381,8 +381,8 @@ class Contacts:
             for pair in sorted(pairs)
             if set(pair) & set(self._body.moved)
         ]
-        text = "bodies that touch where the file puts them, whose contacts are allowed"
-        return [f"{text}: {listed(touching)}"] if touching else []
+        what = "left out: contacts of bodies that touch where the file puts them"
+        return [f"{what}: {listed(touching)}"] if touching else []
 
     def near(self, positions: Array) -> set[tuple[int, int]]:
         """Return the pairs that the engine finds in contact at positions, (n,)."""
@@ -542,35 +542,25 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
     import mujoco
 
-    kinds, single = mujoco.mjtObj, {a for a, *_ in actuators(model)}
-    numbers = np.arange(model.njnt)
-    kinked = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1))).any(axis=1)
-    left = {
-        "joints that stay where the file puts them": (
-            kinds.mjOBJ_JOINT,
-            np.setdiff1d(numbers, ids),
-        ),
-        "actuators that move no hinge or slide alone, which are left out": (
+    kinds = mujoco.mjtObj
+    of_joints = [a for a, *_ in actuators(model)]
+    bent = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1))).any(axis=1)
+    carried = [j for j in ids if model.jnt_actgravcomp.any() > model.jnt_actgravcomp[j]]
+    left = (
+        ("joints that stay in their place", kinds.mjOBJ_JOINT, {*range(model.njnt)} - {*ids}),
+        (
+            "actuators that move no hinge or slide alone",
             kinds.mjOBJ_ACTUATOR,
-            [a for a in range(len(model.actuator_trntype)) if a not in single],
+            {*range(len(model.actuator_trntype))} - {*of_joints},
         ),
-        "equality constraints that are left out": (kinds.mjOBJ_EQUALITY, range(model.neq)),
-        "tendons whose dry friction is left out": (
-            kinds.mjOBJ_TENDON,
-            np.flatnonzero(model.tendon_frictionloss),
-        ),
-        "joints whose compensation of gravity is left out": (
-            kinds.mjOBJ_JOINT,
-            [j for j in ids if model.jnt_actgravcomp.any() > model.jnt_actgravcomp[j]],
-        ),
-        "joints whose damping of higher order is left out": (
-            kinds.mjOBJ_JOINT,
-            np.unique(model.dof_jntid[kinked]),
-        ),
-    }
+        ("equality constraints", kinds.mjOBJ_EQUALITY, range(model.neq)),
+        ("dry friction of tendons", kinds.mjOBJ_TENDON, np.flatnonzero(model.tendon_frictionloss)),
+        ("compensation of gravity of joints", kinds.mjOBJ_JOINT, carried),
+        ("damping of higher order of joints", kinds.mjOBJ_JOINT, {*model.dof_jntid[bent]}),
+    )
     return [
-        f"{text}: {listed([_name(model, kind, i) for i in which])}"
-        for text, (kind, which) in left.items()
+        f"left out: {what}: {listed([_name(model, kind, i) for i in sorted(which)])}"
+        for what, kind, which in left
         if len(which)
     ]
 

@@ -20,12 +20,12 @@ from dopt.arguments import whole, within
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
 from dopt.robots.limits import Limits, check_weight
-from dopt.robots.parameters import Identifiability, Parameter, Unknowns, count_null, relative_errors
+from dopt.robots.parameters import Parameter, Unknowns, count_null, relative_errors
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
 from dopt.types import Array
 
 COARSE = 0.04
-"""Time between the rows of a motion while it is searched [s]."""
+"""Most time between the rows of a motion while it is searched [s]."""
 
 FINE = 0.01
 """Time between the rows of a motion whose torques and collisions are checked at the end [s]."""
@@ -132,6 +132,7 @@ class Problem:
         self.body, self.limits = body, limits
         check_weight(body, limits)
         self.seconds = within("seconds of a design", seconds, math.inf)
+        self.step = min(COARSE, self.seconds / 50.0)
         self.rate = within("rate of a design", rate, math.inf)
         noise = within("noise of a design", noise, math.inf)
         asked = Unknowns(body, limits, wanted, noise)
@@ -183,7 +184,7 @@ class Problem:
         """
         reach = 1.0
         for _ in range(6):
-            motion = family.motion(numbers, COARSE, reach)
+            motion = family.motion(numbers, self.step, reach)
             rigid = self.body.regressor(motion)
             strain = self.strain(motion, rigid)
             if strain <= ROOM:  # between these rows it may be larger
@@ -199,7 +200,7 @@ class Problem:
 
     def obstacle(self, one: Candidate) -> str:
         """Say which torque is too large or which bodies touch at finer steps; "" if none do."""
-        motion, body = one.motion(FINE), self.body
+        motion, body = one.motion(min(FINE, self.step)), self.body
         strains = self._strains(motion).max(axis=0)
         if strains.max() > 1.0:
             k, limit = int(strains.argmax()), self.limits.torque
@@ -243,19 +244,6 @@ class Design:
     def best(self) -> Candidate:
         return self.candidates[0]
 
-    @property
-    def intervals(self) -> dict[str, tuple[float, float]]:
-        """Expected half-widths of 95 % intervals of the best: in the parameter's unit, relative."""
-        return {
-            one.name: (1.96 * error * one.scale, 1.96 * float(error))
-            for one, error in zip(self.problem.requested, self.best.errors, strict=True)
-        }
-
-    def check(self) -> Identifiability:
-        """Return what the best motion cannot tell."""
-        motion = self.best.motion(COARSE)
-        return Identifiability.of(self.problem.unknowns, motion, self.problem.rate)
-
     @classmethod
     def of(
         cls,
@@ -289,7 +277,7 @@ class Design:
                 f"a pose in which the robot is free, or larger torques."
             )
         bound, gap = attainable(problem, rng)
-        null = count_null(problem.tangent, drawn[0].motion(COARSE))
+        null = count_null(problem.tangent, drawn[0].motion(problem.step))
         identified = max(problem.count - null, 1)
         shared = [
             dataclasses.replace(one, share=math.exp((one.determinant - bound) / identified))

@@ -280,7 +280,7 @@ def _beyond(body: Body, limits: Mapping[str, Array], own: Mapping[str, list[Any]
             name
             for name, given, limit in zip(body.joints, limits[kind], own[kind], strict=True)
             if limit is not None
-            and (np.max(given) > np.max(limit) or kind == "position" and given[0] < limit[0])
+            and (np.max(given) > np.max(limit) or (kind == "position" and given[0] < limit[0]))
         ]
         if names:
             yield f"the {kind} of {listed(names)} goes beyond the robot's file: check it"

@@ -101,7 +101,7 @@ def inverse(body: Body, motion: Motion, model: object = None) -> np.ndarray:
 def test_torques_are_those_of_the_engine(arm: Body) -> None:
     assert arm.joints == ("turn", "slide", "lift", "roll")
     assert arm.bodies == ("base", "link", "hand")
-    assert arm.notes == ("joints that stay where the file puts them: joint4 (free)",)
+    assert arm.notes == ("left out: joints that stay in their place: joint4 (free)",)
     for body in (arm, jaco()):
         damping = body.model.dof_damping.copy()
         motion = random_motion(body.n)
@@ -375,7 +375,7 @@ def test_home_is_within_the_ranges_and_what_touches_there_is_named() -> None:
     assert away.notes == ()
     assert [pair for _, *pair in away.collisions(np.zeros((1, 2)))] == [["world", "fore"]]
     assert within.notes == (
-        "bodies that touch where the file puts them, whose contacts are allowed: world and fore",
+        "left out: contacts of bodies that touch where the file puts them: world and fore",
     )
     assert within.collisions(np.zeros((1, 2))) == []
 
@@ -429,10 +429,10 @@ def test_what_is_left_out_is_named() -> None:
     )
     assert body.joints == ("a",)
     assert body.notes == (
-        "joints that stay where the file puts them: root (free), b, c",
-        "actuators that move no hinge or slide alone, which are left out: pull",
-        "equality constraints that are left out: mimic",
-        "tendons whose dry friction is left out: rope",
+        "left out: joints that stay in their place: root (free), b, c",
+        "left out: actuators that move no hinge or slide alone: pull",
+        "left out: equality constraints: mimic",
+        "left out: dry friction of tendons: rope",
     )
 
 
@@ -448,7 +448,7 @@ def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:
     )
     body = Body.load(tmp_path / "gripper.urdf")
     assert body.joints == ("left",)
-    assert body.notes[0] == "joints that stay where the file puts them: right"
+    assert body.notes[0] == "left out: joints that stay in their place: right"
     limits = Limits.of(body)
     assert (limits.torque, limits.velocity) == ([20.0], [0.2])
     text = (tmp_path / "gripper.urdf").read_text()
