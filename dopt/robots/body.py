@@ -119,6 +119,7 @@ class Body:
             raise SpecificationError(
                 f"a robot needs MuJoCo, which is not installed: {install_command('mujoco')}."
             ) from error
+        log_warnings()
         try:
             try:
                 model = mujoco.MjModel.from_xml_path(str(source))
@@ -165,7 +166,8 @@ class Body:
         positions = (model.key_qpos[0] if model.nkey else model.qpos0)[self.addresses]
         low, high = model.jnt_range[self._ids].T
         outside = model.jnt_limited[self._ids] & ((positions < low) | (positions > high))
-        return np.where(outside, (low + high) / 2.0, positions)
+        result: Array = np.where(outside, (low + high) / 2.0, positions)
+        return result
 
     def _inertial_of(self, b: int) -> Array:
         model = self.model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -413,6 +414,23 @@ except SpecificationError as error:
     command = [sys.executable, "-c", text, tmp_path / "arm.xml"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout
+
+
+def test_a_file_that_the_engine_warns_of_writes_nothing(tmp_path: Path) -> None:
+    text = ARM.replace('angle="radian"', 'angle="radian" settotalmass="7"')
+    (tmp_path / "arm.xml").write_text(text)
+    code = "from dopt.robots import Body; print(*Body.load('arm.xml').joints)"
+    path = {"PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "turn slide lift roll\n"
+    assert [one.name for one in tmp_path.iterdir()] == ["arm.xml"]
 
 
 def test_what_is_left_out_is_named() -> None:
