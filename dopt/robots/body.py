@@ -114,19 +114,12 @@ class Body:
                 f"there is no file {source}, but a robot in MJCF or URDF is expected: correct it."
             )
         try:
-            import mujoco
+            log_warnings()
+            _, model = specification(source)
         except ModuleNotFoundError as error:
             raise SpecificationError(
                 f"a robot needs MuJoCo, which is not installed: {install_command('mujoco')}."
             ) from error
-        log_warnings()
-        try:
-            try:
-                model = mujoco.MjModel.from_xml_path(str(source))
-            except ValueError as error:
-                if "Error opening file" not in str(error) and "resource" not in str(error).lower():
-                    raise
-                model = without_meshes(source).compile()
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
             remedy = f"put {BOUNDS} into its <robot>" if "inertia" in text else "correct it"
@@ -579,14 +572,20 @@ def _name(model: mujoco.MjModel, kind: Any, i: int) -> str:
     return f"{name} (free)" if free else name
 
 
-def without_meshes(source: Path) -> mujoco.MjSpec:
-    """Return the specification of a file without its meshes, which are not there."""
+def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Return what a file says and its model, without the meshes if one is not there."""
     import mujoco
 
+    spec = mujoco.MjSpec.from_file(str(source))
+    try:
+        return spec, spec.compile()
+    except ValueError as error:
+        if "Error opening file" not in str(error) and "resource" not in str(error).lower():
+            raise
     spec = mujoco.MjSpec.from_file(str(source))
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
             spec.delete(geom)
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
-    return spec
+    return spec, spec.compile()

@@ -250,27 +250,20 @@ def _checked(source: Path, what: str, value: Any, is_range: bool) -> Any:
 
 def _suspicious(
     body: Body, limits: Mapping[str, Array], given: Mapping[tuple[str, str], Any]
-) -> list[str]:
-    """Return a sentence for each kind of limit that looks like a default of the robot's file."""
-    found = []
+) -> Iterator[str]:
+    """Yield a sentence for each kind of limit that looks like a default of the robot's file."""
     for kind, size, unit in (("velocity", FAST, "rad/s"), ("torque", STRONG, "N m")):
-        own = [
-            v
-            for v, name in zip(limits[kind], body.joints, strict=True)
-            if (name, kind) not in given
-        ]
+        pairs = zip(limits[kind], body.joints, strict=True)
+        own = [value for value, name in pairs if (name, kind) not in given]
         if len(own) > 2 and len(set(own)) == 1:
             looks = "looks like a default" if own[0] >= size else "may be a default"
-            found.append(
+            yield (
                 f"every joint has the {kind} {own[0]:g} {unit}, which {looks}: look it up in the "
                 f"robot's data sheet"
             )
-    wide = [
-        n for n, r in zip(body.joints, limits["position"], strict=True) if np.ptp(r) > 4 * np.pi
-    ]
-    if wide:
-        found.append(f"the range of {listed(wide)} is more than two turns: check it")
-    return found
+    ranges = zip(body.joints, limits["position"], strict=True)
+    if wide := [name for name, one in ranges if np.ptp(one) > 4 * np.pi]:
+        yield f"the range of {listed(wide)} is more than two turns: check it"
 
 
 def _beyond(body: Body, limits: Mapping[str, Array], own: Mapping[str, list[Any]]) -> Iterator[str]:

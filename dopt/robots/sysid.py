@@ -9,7 +9,7 @@ import numpy as np
 
 from dopt.arguments import within
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body, without_meshes
+from dopt.robots.body import Body, specification
 from dopt.types import Array
 
 if TYPE_CHECKING:
@@ -104,11 +104,7 @@ def _measured(body: Body, dt: float) -> Any:
             "the robot was not read from a file, but mujoco.sysid needs its specification: read "
             "it by Body.load()."
         )
-    try:
-        spec = mujoco.MjSpec.from_file(str(body.source))
-        spec.compile()
-    except ValueError:
-        spec = without_meshes(body.source)
+    spec, _ = specification(body.source)
     for part in [*spec.keys, *spec.actuators, *spec.sensors]:
         spec.delete(part)
     spec.option.timestep = dt
