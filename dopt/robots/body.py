@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,6 +72,8 @@ class Body:
     model : mujoco.MjModel
     source : Path, optional
         The file, from which an URDF's limits of velocity are read.
+    lost : sequence of str
+        Meshes of the file that the model lacks.
 
     Attributes
     ----------
@@ -81,11 +83,13 @@ class Body:
         Names of the bodies that a driven joint moves.
     """
 
-    def __init__(self, model: mujoco.MjModel, source: Path | None = None) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, source: Path | None = None, lost: Sequence[str] = ()
+    ) -> None:
         import mujoco
 
         log_warnings()
-        self.model, self.source = _effective(model), source
+        self.model, self.source, self._lost = _effective(model), source, list(lost)
         self._ids = _driven_joints(model)
         if not self._ids:
             raise SpecificationError(
@@ -115,24 +119,27 @@ class Body:
             )
         try:
             log_warnings()
-            _, model = specification(source)
+            _, model, lost = specification(source)
         except ModuleNotFoundError as error:
             raise SpecificationError(
                 f"a robot needs MuJoCo, which is not installed: {install_command('mujoco')}."
             ) from error
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
-            remedy = f"put {BOUNDS} into its <robot>" if "inertia" in text else "correct it"
+            urdf = "inertia" in text and b"<robot" in source.read_bytes()
+            remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
                 f"{remedy}."
             ) from error
-        return cls(model, source)
+        return cls(model, source, lost)
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """What the model holds and the torques, or searches for collisions, leave out."""
-        return (*_left_out(self.model, self._ids), *self._contacts.left_out())
+        lost = f"left out: meshes and their contacts, for one is not there: {listed(self._lost)}"
+        left = _left_out(self.model, self._ids)
+        return (*[lost][: len(self._lost)], *left, *self._contacts.left_out())
 
     @property
     def n(self) -> int:
@@ -572,13 +579,13 @@ def _name(model: mujoco.MjModel, kind: Any, i: int) -> str:
     return f"{name} (free)" if free else name
 
 
-def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """Return what a file says and its model, without the meshes if one is not there."""
+def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]:
+    """Return what a file says, its model, and the meshes that both lack, if one is not there."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(source))
     try:
-        return spec, spec.compile()
+        return spec, spec.compile(), []
     except ValueError as error:
         if "Error opening file" not in str(error) and "resource" not in str(error).lower():
             raise
@@ -586,6 +593,7 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
             spec.delete(geom)
+    lost = [Path(mesh.file).name for mesh in spec.meshes]
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
-    return spec, spec.compile()
+    return spec, spec.compile(), lost

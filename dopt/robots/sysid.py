@@ -104,7 +104,7 @@ def _measured(body: Body, dt: float) -> Any:
             "the robot was not read from a file, but mujoco.sysid needs its specification: read "
             "it by Body.load()."
         )
-    spec, _ = specification(body.source)
+    spec, *_ = specification(body.source)
     for part in [*spec.keys, *spec.actuators, *spec.sensors]:
         spec.delete(part)
     spec.option.timestep = dt

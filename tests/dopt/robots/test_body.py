@@ -416,6 +416,17 @@ except SpecificationError as error:
     assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout
 
 
+def test_meshes_that_are_not_there_are_said(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        """<mujoco><asset><mesh name="m" file="parts/link.stl"/></asset><worldbody>
+        <body><joint name="a"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+        <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+    )
+    body = Body.load(tmp_path / "arm.xml")
+    said = "left out: meshes and their contacts, for one is not there: link.stl"
+    assert (body.model.ngeom, body.notes) == (0, (said,))
+
+
 def test_a_file_that_the_engine_warns_of_writes_nothing(tmp_path: Path) -> None:
     text = ARM.replace('angle="radian"', 'angle="radian" settotalmass="7"')
     (tmp_path / "arm.xml").write_text(text)
