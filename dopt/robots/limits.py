@@ -27,6 +27,9 @@ FAST, STRONG = 2.0 * math.pi, 300.0
 WIDE = 1e3
 """Torques of this size in a robot's file are none."""
 
+TINY = 1e-3
+"""Friction, as a share of the limit of torque, below which it looks like a default."""
+
 POSES = 1000
 """Random positions in which a robot's weight is compared with its limits of torque."""
 
@@ -260,6 +263,15 @@ def _suspicious(
             yield (
                 f"every joint has the {kind} {own[0]:g} {unit}, which {looks}: look it up in the "
                 f"robot's data sheet"
+            )
+    dry, viscous = body.model.dof_frictionloss[body.dofs], body.model.dof_damping[body.dofs]
+    for kind, torques in (("frictionloss", dry), ("damping", viscous * limits["velocity"])):
+        tiny = np.flatnonzero((torques > 0.0) & (torques < TINY * limits["torque"]))
+        if tiny.size:
+            yield (
+                f"the {kind} of {listed([body.joints[k] for k in tiny])} is less than "
+                f"{100.0 * TINY:g} % of the limit of torque, and counts as known to about its own "
+                f"size: correct it in the robot's file if it is a default"
             )
     ranges = zip(body.joints, limits["position"], strict=True)
     if wide := [name for name, one in ranges if np.ptp(one) > 4 * np.pi]:

@@ -256,6 +256,14 @@ def test_limits_come_from_the_file_then_the_robot(limits: Limits) -> None:
     np.testing.assert_allclose(limits.position[1], [-0.3, 0.3])
 
 
+def test_friction_that_looks_like_a_default_is_said(arm: Body, tmp_path: Path) -> None:
+    """Of a torque of 10 N m, at 2 rad/s: a damping of 0.004 N m s/rad is 0.08 %."""
+    arm.model.dof_damping[arm.dofs] = [0.0, 0.0, 0.004, 0.02]
+    said, *others = limits_of(arm, tmp_path, LIMITS).notes
+    assert said.startswith("the damping of lift is less than 0.1 % of the limit of torque")
+    assert not others
+
+
 def test_limits_beyond_the_file_are_said(arm: Body, tmp_path: Path) -> None:
     wide = "turn: {position: [-2.1, 2]}, slide: {position: 0.3, torque: 61}, lift: {torque: 9}"
     assert limits_of(arm, tmp_path, f"joints: {{default: {{velocity: 2}}, {wide}}}").notes[:2] == (
