@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,9 @@ from dopt.types import Array
 
 if TYPE_CHECKING:
     import mujoco
+
+BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia="1e-6"/></mujoco>'
+"""What an URDF needs whose inertias are those of no body."""
 
 INERTIAL = 10
 """Inertial parameters of a body: m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about its origin."""
@@ -59,14 +63,17 @@ class Body:
     """Rigid body of a robot, read from an MJCF or URDF file.
 
     Driven joints are hinges and slides that an actuator moves, or all hinges and slides where the
-    file has no actuators, as in URDF. Other joints stay where the file puts them. Contacts,
-    tendons and equality constraints produce no torque here; :attr:`notes` says what was left out.
+    file has no actuators, as in URDF, except those that a constraint couples to another. Other
+    joints stay where the file puts them. Contacts and constraints produce no torque here;
+    :attr:`notes` says what was left out.
 
     Parameters
     ----------
     model : mujoco.MjModel
     source : Path, optional
         The file, from which an URDF's limits of velocity are read.
+    lost : sequence of str
+        Meshes of the file that the model lacks.
 
     Attributes
     ----------
@@ -74,15 +81,15 @@ class Body:
         Names of the n driven joints.
     bodies : tuple of str
         Names of the bodies that a driven joint moves.
-    notes : tuple of str
-        What the model holds and the torques leave out.
     """
 
-    def __init__(self, model: mujoco.MjModel, source: Path | None = None) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, source: Path | None = None, lost: Sequence[str] = ()
+    ) -> None:
         import mujoco
 
         log_warnings()
-        self.model, self.source = model, source
+        self.model, self.source, self._lost = _effective(model), source, list(lost)
         self._ids = _driven_joints(model)
         if not self._ids:
             raise SpecificationError(
@@ -95,7 +102,6 @@ class Body:
         self._paths = _paths(model, self._ids)
         self.moved = tuple(b for b in range(1, model.nbody) if self._paths[b])
         self.bodies = tuple(_name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in self.moved)
-        self.notes = tuple(_left_out(model, self._ids))
 
     @classmethod
     def load(cls, file: str | Path) -> Body:
@@ -112,30 +118,38 @@ class Body:
                 f"there is no file {source}, but a robot in MJCF or URDF is expected: correct it."
             )
         try:
-            import mujoco
+            log_warnings()
+            _, model, lost = specification(source)
         except ModuleNotFoundError as error:
             raise SpecificationError(
                 f"a robot needs MuJoCo, which is not installed: {install_command('mujoco')}."
             ) from error
-        try:
-            try:
-                model = mujoco.MjModel.from_xml_path(str(source))
-            except ValueError as error:
-                if "Error opening file" not in str(error) and "resource" not in str(error).lower():
-                    raise
-                model = without_meshes(source).compile()
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
+            urdf = "inertia" in text and b"<robot" in source.read_bytes()
+            remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
-                f"correct it."
+                f"{remedy}."
             ) from error
-        return cls(model, source)
+        return cls(model, source, lost)
+
+    @functools.cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What the model holds and the torques, or searches for collisions, leave out."""
+        lost = f"left out: meshes and their contacts, for one is not there: {listed(self._lost)}"
+        left = _left_out(self.model, self._ids)
+        return (*[lost][: len(self._lost)], *left, *self._contacts.left_out())
 
     @property
     def n(self) -> int:
         """Number of driven joints."""
         return len(self._ids)
+
+    @property
+    def units(self) -> list[str]:
+        """Units of the torques, "N m" or "N"."""
+        return ["N" if kind == SLIDE else "N m" for kind in self.model.jnt_type[self._ids]]
 
     @property
     def inertial(self) -> Array:
@@ -144,9 +158,16 @@ class Body:
 
     @property
     def home(self) -> Array:
-        """Positions of the driven joints in the file, or in its first keyframe, (n,)."""
-        positions = self.model.key_qpos[0] if self.model.nkey else self.model.qpos0
-        return np.array(positions[self.addresses])
+        """Positions of the driven joints in the file, or in its first keyframe, (n,).
+
+        A joint that is out of its range there is in the middle of it.
+        """
+        model = self.model
+        positions = (model.key_qpos[0] if model.nkey else model.qpos0)[self.addresses]
+        low, high = model.jnt_range[self._ids].T
+        outside = model.jnt_limited[self._ids] & ((positions < low) | (positions > high))
+        result: Array = np.where(outside, (low + high) / 2.0, positions)
+        return result
 
     def _inertial_of(self, b: int) -> Array:
         model = self.model
@@ -167,16 +188,20 @@ class Body:
     def torques(self, motion: Motion, regressor: Array | None = None) -> Array:
         """Return the torques that move the body, without friction, (T, n).
 
-        Includes armature and springs of the joints, as the file gives them. The regressor of the
-        motion, where it is known already, saves time.
+        Includes armature, springs, tendons and fluids, as the file gives them. The regressor of
+        the motion, where it is known already, saves time.
         """
+        model = self.model
+        if model.jnt_stiffness.any() or model.ntendon or model.opt.density or model.opt.viscosity:
+            states = zip(motion.positions, motion.velocities, motion.accelerations, strict=True)
+            return np.array([self._known.inverse(*state) for state in states])
         rows = self.regressor(motion) if regressor is None else regressor
-        rigid = rows @ self.inertial
-        stiff = self.model.jnt_stiffness[self._ids]
-        away = motion.positions - self.model.qpos_spring[self.addresses]
-        armature = self.model.dof_armature[self.dofs]
-        result: Array = rigid + armature * motion.accelerations + stiff * away
+        result: Array = rows @ self.inertial + model.dof_armature[self.dofs] * motion.accelerations
         return result
+
+    @functools.cached_property
+    def _known(self) -> KnownBody:
+        return KnownBody(self)
 
     def _frames(self, motion: Motion) -> dict[int, tuple[Array, ...]]:
         """Return rotation, origin, velocity, acceleration and Jacobian of each body, by time.
@@ -258,6 +283,59 @@ class Body:
         return Contacts(self)
 
 
+class KnownBody:
+    """Inverse dynamics of a body at 500 Hz, without friction, contacts and limits.
+
+    Joints that are not driven stay at rest.
+    """
+
+    def __init__(self, body: Body) -> None:
+        import mujoco
+
+        self.body, self.model, self._engine = body, copy.copy(body.model), mujoco
+        self.model.opt.disableflags |= (
+            mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        )
+        self.model.dof_damping[:] = 0.0
+        self.model.dof_frictionloss[:] = 0.0
+        if hasattr(self.model, "dof_dampingpoly"):
+            self.model.dof_dampingpoly[:] = 0.0
+        self._data = mujoco.MjData(self.model)
+        self._unit, self._column = np.zeros(self.model.nv), np.zeros(self.model.nv)
+
+    def inverse(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the torques [N m], (n,), that accelerate the body so."""
+        data, dofs = self._data, self.body.dofs
+        data.qpos[self.body.addresses] = q
+        data.qvel[dofs] = v
+        data.qacc[dofs] = a
+        self._engine.mj_inverse(self.model, data)
+        return np.array(data.qfrc_inverse[dofs])
+
+    def mass_matrix(self) -> Array:
+        """Return M, (n, n), at the position of the last call of :meth:`inverse`."""
+        dofs = self.body.dofs
+        M = np.empty((len(dofs), len(dofs)))
+        for k, dof in enumerate(dofs):
+            self._unit[dof] = 1.0
+            self._engine.mj_mulM(self.model, self._data, self._column, self._unit)
+            self._unit[dof] = 0.0
+            M[k] = self._column[dofs]
+        return M
+
+    def hang(self, mass: float, moment: Array) -> None:
+        """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
+        model, last = self.model, self.body.moved[-1]
+        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
+        total = own + mass
+        model.body_mass[last] = total
+        model.body_ipos[last] = (own * centre + moment) / total
+        if mass > 0.0:
+            away = moment / mass - centre
+            model.body_inertia[last] += own * mass / total * (away @ away)
+        self._engine.mj_setConst(model, self._data)
+
+
 class Contacts:
     """Pairs of bodies that come near each other, and do not touch at home.
 
@@ -296,6 +374,17 @@ class Contacts:
         self._engine.mj_collision(self._model, data)
         contact = data.contact
         return self._model.geom_bodyid[contact.geom], np.array(contact.dist)
+
+    def left_out(self) -> list[str]:
+        """Name the bodies that touch at home, of which contacts are not counted."""
+        pairs = {tuple(sorted(pair)) for pair in self._pass(self._body.home)[0].tolist()}
+        touching = [
+            " and ".join(_name(self._model, self._engine.mjtObj.mjOBJ_BODY, b) for b in pair)
+            for pair in sorted(pairs)
+            if set(pair) & set(self._body.moved)
+        ]
+        what = "left out: contacts of bodies that touch where the file puts them"
+        return [f"{what}: {listed(touching)}"] if touching else []
 
     def near(self, positions: Array) -> set[tuple[int, int]]:
         """Return the pairs that the engine finds in contact at positions, (n,)."""
@@ -402,13 +491,45 @@ def rotation(quaternion: Array) -> Array:
     return result
 
 
+def _effective(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy whose joints have what its flags and actuators change.
+
+    Without gravity where it is disabled, and with the armature and the damping of actuators.
+    Gravity that actuators compensate is a part of their torques.
+    """
+    import mujoco
+
+    model = copy.copy(model)
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        model.opt.gravity[:] = 0.0
+    if model.jnt_actgravcomp.any():
+        model.body_gravcomp[:] = 0.0
+    for a, j, gear, _ in actuators(model) if hasattr(model, "actuator_armature") else ():
+        dof = model.jnt_dofadr[j]
+        model.dof_armature[dof] += gear**2 * model.actuator_armature[a]
+        model.dof_damping[dof] += gear**2 * model.actuator_damping[a]
+        model.actuator_armature[a] = model.actuator_damping[a] = 0.0
+    return model
+
+
+def actuators(model: mujoco.MjModel) -> Iterator[tuple[int, int, float, int]]:
+    """Yield the actuators of hinges and slides: number, joint, gear and place of its control."""
+    controls, outputs = (getattr(model, f"actuator_{kind}adr", None) for kind in ("ctrl", "out"))
+    for a, (target, _) in enumerate(model.actuator_trnid):
+        of_joint = model.actuator_trntype[a] in (0, 1)  # of a joint, or in its parent's frame
+        if of_joint and model.jnt_type[target] in (HINGE, SLIDE):
+            gear = float(model.actuator_gear[a if outputs is None else outputs[a], 0])
+            yield a, int(target), gear, a if controls is None else int(controls[a])
+
+
 def _driven_joints(model: mujoco.MjModel) -> list[int]:
+    import mujoco
+
+    by_joint = {j for _, j, _, _ in actuators(model)}
+    coupled = model.eq_obj1id[(model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0]
     free = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
-    if not model.nu:
-        return free
-    of_joints = np.isin(model.actuator_trntype, (0, 1))  # of a joint, or in its parent's frame
-    by_joint = {int(j) for j in model.actuator_trnid[of_joints, 0]}
-    return [j for j in free if j in by_joint] or free
+    return sorted(by_joint) or [j for j in free if j not in coupled]
 
 
 def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
@@ -421,29 +542,58 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
 
 
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
-    held = model.njnt - len(ids)
-    left = {
-        f"joints without an actuator, which stay where the file puts them: {held}": held,
-        f"tendons that are left out: {model.ntendon}": model.ntendon,
-        f"equality constraints that are left out: {model.neq}": model.neq,
-    }
-    return [text for text, count in left.items() if count]
+    import mujoco
+
+    kinds = mujoco.mjtObj
+    of_joints = [a for a, *_ in actuators(model)]
+    bent = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1))).any(axis=1)
+    carried = [j for j in ids if model.jnt_actgravcomp.any() > model.jnt_actgravcomp[j]]
+    left = (
+        ("joints that stay in their place", kinds.mjOBJ_JOINT, {*range(model.njnt)} - {*ids}),
+        (
+            "actuators that move no hinge or slide alone",
+            kinds.mjOBJ_ACTUATOR,
+            {*range(len(model.actuator_trntype))} - {*of_joints},
+        ),
+        ("equality constraints", kinds.mjOBJ_EQUALITY, range(model.neq)),
+        ("dry friction of tendons", kinds.mjOBJ_TENDON, np.flatnonzero(model.tendon_frictionloss)),
+        ("compensation of gravity of joints", kinds.mjOBJ_JOINT, carried),
+        ("damping of higher order of joints", kinds.mjOBJ_JOINT, {*model.dof_jntid[bent]}),
+    )
+    return [
+        f"left out: {what}: {listed([_name(model, kind, i) for i in sorted(which)])}"
+        for what, kind, which in left
+        if len(which)
+    ]
+
+
+def listed(names: list[str]) -> str:
+    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _name(model: mujoco.MjModel, kind: Any, i: int) -> str:
     import mujoco
 
-    return mujoco.mj_id2name(model, kind, int(i)) or f"{kind.name[6:].lower()}{i}"
+    name = mujoco.mj_id2name(model, kind, int(i)) or f"{kind.name[6:].lower()}{i}"
+    free = kind == mujoco.mjtObj.mjOBJ_JOINT and model.jnt_type[i] == mujoco.mjtJoint.mjJNT_FREE
+    return f"{name} (free)" if free else name
 
 
-def without_meshes(source: Path) -> mujoco.MjSpec:
-    """Return the specification of a file without its meshes, which are not there."""
+def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]:
+    """Return what a file says, its model, and the meshes that both lack, if one is not there."""
     import mujoco
 
+    spec = mujoco.MjSpec.from_file(str(source))
+    try:
+        return spec, spec.compile(), []
+    except ValueError as error:
+        if "Error opening file" not in str(error) and "resource" not in str(error).lower():
+            raise
     spec = mujoco.MjSpec.from_file(str(source))
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
             spec.delete(geom)
+    lost = [Path(mesh.file).name for mesh in spec.meshes]
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
-    return spec
+    return spec, spec.compile(), lost

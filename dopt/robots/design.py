@@ -19,13 +19,13 @@ import numpy as np
 from dopt.arguments import whole, within
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
-from dopt.robots.limits import Limits
-from dopt.robots.parameters import Identifiability, Parameter, Unknowns, count_null, relative_errors
+from dopt.robots.limits import Limits, check_weight
+from dopt.robots.parameters import Parameter, Unknowns, count_null, relative_errors
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
 from dopt.types import Array
 
 COARSE = 0.04
-"""Time between the rows of a motion while it is searched [s]."""
+"""Most time between the rows of a motion while it is searched [s]."""
 
 FINE = 0.01
 """Time between the rows of a motion whose torques and collisions are checked at the end [s]."""
@@ -130,7 +130,9 @@ class Problem:
         rate: float = 500.0,
     ) -> None:
         self.body, self.limits = body, limits
+        check_weight(body, limits)
         self.seconds = within("seconds of a design", seconds, math.inf)
+        self.step = min(COARSE, self.seconds / 50.0)
         self.rate = within("rate of a design", rate, math.inf)
         noise = within("noise of a design", noise, math.inf)
         asked = Unknowns(body, limits, wanted, noise)
@@ -165,11 +167,15 @@ class Problem:
         worst = math.log(float(np.max(errors / self.reference)) / ABOVE)
         return -0.5 * determinant / self.count + FLOOR * max(worst, 0.0) + 10.0 * broken
 
+    def _strains(self, motion: Motion, rigid: Array | None = None) -> Array:
+        """Return torques as shares of their limits, friction included, (T, n)."""
+        friction = self._friction * np.tanh(motion.velocities / (0.01 * self.limits.velocity))
+        result: Array = (self.body.torques(motion, rigid) + friction) / self.limits.torque
+        return np.abs(result)
+
     def strain(self, motion: Motion, rigid: Array | None = None) -> float:
         """Return the largest share of the limits of torque, friction included."""
-        friction = self._friction * np.tanh(motion.velocities / (0.01 * self.limits.velocity))
-        torques = self.body.torques(motion, rigid) + friction
-        return float(np.abs(torques / self.limits.torque).max())
+        return float(self._strains(motion, rigid).max())
 
     def candidate(self, family: Family, numbers: Array) -> Candidate:
         """Return a motion with its score; its share is not known yet.
@@ -178,7 +184,7 @@ class Problem:
         """
         reach = 1.0
         for _ in range(6):
-            motion = family.motion(numbers, COARSE, reach)
+            motion = family.motion(numbers, self.step, reach)
             rigid = self.body.regressor(motion)
             strain = self.strain(motion, rigid)
             if strain <= ROOM:  # between these rows it may be larger
@@ -192,11 +198,20 @@ class Problem:
         found = self.determinant(information), self.errors(information), broken
         return Candidate(family.name, family, numbers, reach, *found, self.score(*found))
 
+    def obstacle(self, one: Candidate) -> str:
+        """Say which torque is too large or which bodies touch at finer steps; "" if none do."""
+        motion, body = one.motion(min(FINE, self.step)), self.body
+        strains = self._strains(motion).max(axis=0)
+        if strains.max() > 1.0:
+            k, limit = int(strains.argmax()), self.limits.torque
+            taken = f"{strains[k] * limit[k]:.3g} of {limit[k]:g} {body.units[k]}"
+            return f"joint '{body.joints[k]}' takes {taken}"
+        touching = body.collisions(motion.positions)
+        return f"the bodies {touching[0][1]} and {touching[0][2]} touch" if touching else ""
+
     def checked(self, one: Candidate) -> Candidate:
-        """Return a candidate, broken if torques are too large or bodies touch at finer steps."""
-        motion = one.motion(FINE)
-        broken = self.strain(motion) > 1.0 or bool(self.body.collisions(motion.positions))
-        return dataclasses.replace(one, broken=1.0) if broken else one
+        """Return a candidate, broken if something stands against it at finer steps."""
+        return dataclasses.replace(one, broken=1.0) if self.obstacle(one) else one
 
 
 def _friction(body: Body, limits: Limits) -> Array:
@@ -229,19 +244,6 @@ class Design:
     def best(self) -> Candidate:
         return self.candidates[0]
 
-    @property
-    def intervals(self) -> dict[str, tuple[float, float]]:
-        """Expected half-widths of 95 % intervals of the best: in the parameter's unit, relative."""
-        return {
-            one.name: (1.96 * error * one.scale, 1.96 * float(error))
-            for one, error in zip(self.problem.requested, self.best.errors, strict=True)
-        }
-
-    def check(self) -> Identifiability:
-        """Return what the best motion cannot tell."""
-        motion = self.best.motion(COARSE)
-        return Identifiability.of(self.problem.unknowns, motion, self.problem.rate)
-
     @classmethod
     def of(
         cls,
@@ -266,21 +268,21 @@ class Design:
         seed = whole("seed", seed, 0, 2**63)
         effort = whole("effort", effort, BEGUN, 10**7)
         rng = np.random.default_rng(seed)
-        found = list(_candidates(problem, rng, effort, progress))
+        drawn = list(map(problem.checked, _candidates(problem, rng, effort, progress)))
+        found = sorted(drawn, key=lambda one: (not one.free, one.score))
+        if not found[0].free:
+            raise SpecificationError(
+                f"no motion was found within the limits of torque and without collisions (in the "
+                f"best one, {problem.obstacle(found[0])}): give smaller ranges of position around "
+                f"a pose in which the robot is free, or larger torques."
+            )
         bound, gap = attainable(problem, rng)
-        null = count_null(problem.tangent, found[0].motion(COARSE))
+        null = count_null(problem.tangent, drawn[0].motion(problem.step))
         identified = max(problem.count - null, 1)
         shared = [
             dataclasses.replace(one, share=math.exp((one.determinant - bound) / identified))
-            for one in map(problem.checked, found)
+            for one in found
         ]
-        shared.sort(key=lambda one: (not one.free, one.score))
-        if not shared[0].free:
-            raise SpecificationError(
-                "no motion was found within the limits of torque and without collisions: give "
-                "smaller ranges of position around a pose in which the robot is free, or larger "
-                "torques."
-            )
         return cls(problem, tuple(shared), problem.reference, gap / identified)
 
 
@@ -429,4 +431,9 @@ def _states(problem: Problem, rng: np.random.Generator) -> Motion:
     a /= np.maximum(1.0, torques**2)[:, None]  # towards the torques of rest
     strains = np.abs(problem.body.torques(Motion(1.0, q, v, a)) / limits.torque).max(axis=1)
     kept = np.flatnonzero(strains <= 1.0)[:POOL]
+    if not kept.size:
+        raise SpecificationError(
+            f"the limits of torque hold the robot in none of {2 * POOL} poses that were drawn from "
+            f"its ranges of position: give smaller ranges, or larger torques."
+        )
     return Motion(1.0, q[kept], v[kept], a[kept])

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import xml.etree.ElementTree as Xml
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dopt.errors import SpecificationError, given_path, unknown_name
-from dopt.robots.body import Body, Motion
+from dopt.robots.body import Body, Motion, actuators, listed
 from dopt.types import Array
 
 KINDS = ("position", "velocity", "acceleration", "torque")
@@ -25,7 +25,16 @@ FAST, STRONG = 2.0 * math.pi, 300.0
 """Velocity [rad/s] and torque [N m] from which equal limits of all joints look like defaults."""
 
 WIDE = 1e3
-"""Limits of this size are none."""
+"""Torques of this size in a robot's file are none."""
+
+TINY = 1e-3
+"""Friction, as a share of the limit of torque, below which it looks like a default."""
+
+POSES = 1000
+"""Random positions in which a robot's weight is compared with its limits of torque."""
+
+INTEGRATOR = 1
+"""Dynamics of an actuator, whose control is a rate of its force."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +91,10 @@ class Limits:
         if any(missing.values()):
             raise _missing(body, missing)
         arrays = {kind: np.array(value, dtype=float) for kind, value in values.items()}
-        notes = [*_suspicious(body, arrays, given)]
+        notes = [*_suspicious(body, arrays, given), *_beyond(body, arrays, own)]
         if assumed:
             notes.append(
-                f"no acceleration is given for {_listed(assumed)}: the velocity in {STOPPING:g} s "
+                f"no acceleration is given for {listed(assumed)}: the velocity in {STOPPING:g} s "
                 f"is assumed"
             )
         return cls(**arrays, notes=tuple(notes))
@@ -112,10 +121,27 @@ class Limits:
         return {kind: float(np.abs(part).max()) for kind, part in parts.items()}
 
 
+def check_weight(body: Body, limits: Limits) -> None:
+    """Refuse limits of torque that hold the body at rest in none of many random positions."""
+    low, high = limits.position.T
+    q = low + (high - low) * np.random.default_rng(0).random((POSES, body.n))
+    weights = np.abs(body.torques(Motion(1.0, q, *np.zeros((2, *q.shape)))))
+    shares = weights / limits.torque
+    best = int(shares.max(axis=1).argmin())
+    k = int(shares[best].argmax())
+    if shares[best, k] > 1.0:
+        unit = body.units[k]
+        raise SpecificationError(
+            f"joint '{body.joints[k]}' takes {weights[best, k]:.3g} {unit} at rest, in the best of "
+            f"{POSES} random positions, but its limit of torque is {limits.torque[k]:g} {unit}: "
+            f"give a larger limit, or ranges of position in which it carries less."
+        )
+
+
 def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> SpecificationError:
     """Return the error for limits that no file gives, with the lines that are to be filled in."""
     lacking = {kind: names for kind, names in missing.items() if names}
-    said = "; ".join(f"{kind} of {_listed(list(names))}" for kind, names in lacking.items())
+    said = "; ".join(f"{kind} of {listed(list(names))}" for kind, names in lacking.items())
     every = {kind for kind, names in lacking.items() if len(names) == body.n}
     lines = ["joints:"]
     for name in ("default", *body.joints):
@@ -124,42 +150,54 @@ def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> Specificatio
             blanks = [f"{k}: {'[…, …]' if k == 'position' else '…'}" for k in KINDS if k in kinds]
             lines.append(f"  {name}: {{{', '.join(blanks)}}}")
     return SpecificationError(
-        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N): "
-        f"{said}. Fill in these lines, and give them as a file of limits (--limits FILE):\n"
-        + "\n".join(lines)
+        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N; "
+        f"{WIDE:g} or more in the robot's file is none): {said}. Fill in these lines, and give "
+        f"them as a file of limits (--limits FILE):\n" + "\n".join(lines)
     )
 
 
 def _own(body: Body) -> dict[str, list[Any]]:
     """Return the limits in the robot's own file; None where it has none."""
-    model, ids = body.model, [body.model.joint(name).id for name in body.joints]
-    own: dict[str, list[Any]] = {kind: [None] * body.n for kind in KINDS}
-    for k, j in enumerate(ids):
-        if model.jnt_limited[j]:
-            own["position"][k] = [float(x) for x in model.jnt_range[j]]
-        torque = _torque(body, j)
-        own["torque"][k] = torque if 0.0 < torque < WIDE else None
-    if body.source is not None and body.source.suffix == ".urdf":
-        for joint in Xml.parse(body.source).getroot().iter("joint"):
-            limit, name = joint.find("limit"), joint.get("name")
-            if limit is not None and name in body.joints and "velocity" in limit.keys():  # noqa: SIM118  # an element, no mapping
-                own["velocity"][body.joints.index(name)] = float(limit.get("velocity", 0.0)) or None
-    return own
+    model, torques, velocities = body.model, _torques(body), _velocities(body.source)
+    ids = model.dof_jntid[body.dofs]
+    return {
+        "position": [model.jnt_range[j].tolist() if model.jnt_limited[j] else None for j in ids],
+        "velocity": [velocities.get(name) for name in body.joints],
+        "acceleration": [None] * body.n,
+        "torque": [torques[j] if 0.0 < torques[j] < WIDE else None for j in ids],
+    }
 
 
-def _torque(body: Body, j: int) -> float:
-    """Return the largest torque of a joint by its own range and its actuators."""
-    model, found = body.model, math.inf
-    if model.jnt_actfrclimited[j]:
-        found = float(np.abs(model.jnt_actfrcrange[j]).min())
-    for a in range(model.nu):
-        if int(model.actuator_trntype[a]) in (0, 1) and int(model.actuator_trnid[a, 0]) == j:
-            gear = abs(float(model.actuator_gear[a, 0]))
-            if model.actuator_forcelimited[a]:
-                found = min(found, gear * float(np.abs(model.actuator_forcerange[a]).min()))
-            elif model.actuator_ctrllimited[a] and not model.actuator_biastype[a]:
-                gain = gear * abs(float(model.actuator_gainprm[a, 0]))
-                found = min(found, gain * float(np.abs(model.actuator_ctrlrange[a]).min()))
+def _velocities(source: Path | None) -> dict[str | None, float | None]:
+    """Return the limits of velocity in an URDF, by its joints."""
+    try:
+        joints = Xml.fromstring(source.read_bytes().strip()).iter("joint") if source else ()
+    except Xml.ParseError:  # of a prefix that is not declared, which the engine lets pass
+        return {}
+    limits = ((joint.get("name"), joint.find("limit")) for joint in joints)
+    return {
+        name: float(limit.get("velocity", 0.0)) or None
+        for name, limit in limits
+        if limit is not None
+    }
+
+
+def _torques(body: Body) -> Array:
+    """Return the largest torque of every joint by its own range and its actuators."""
+    model = body.model
+    own = np.abs(model.jnt_actfrcrange).min(axis=1)
+    found: Array = np.where(model.jnt_actfrclimited, own, math.inf)
+    for a, j, gear, control in actuators(model):
+        if model.actuator_forcelimited[a]:
+            found[j] = min(found[j], abs(gear) * np.abs(model.actuator_forcerange[a]).min())
+        plain = (model.actuator_gaintype[a], model.actuator_biastype[a]) == (0, 0)
+        if (
+            plain
+            and model.actuator_dyntype[a] != INTEGRATOR
+            and model.actuator_ctrllimited[control]
+        ):
+            gain = abs(gear * model.actuator_gainprm[a, 0])
+            found[j] = min(found[j], gain * np.abs(model.actuator_ctrlrange[control]).min())
     return found
 
 
@@ -215,31 +253,42 @@ def _checked(source: Path, what: str, value: Any, is_range: bool) -> Any:
 
 def _suspicious(
     body: Body, limits: Mapping[str, Array], given: Mapping[tuple[str, str], Any]
-) -> list[str]:
-    """Return a sentence for each kind of limit that looks like a default of the robot's file."""
-    found = []
+) -> Iterator[str]:
+    """Yield a sentence for each kind of limit that looks like a default of the robot's file."""
     for kind, size, unit in (("velocity", FAST, "rad/s"), ("torque", STRONG, "N m")):
-        own = [
-            v
-            for v, name in zip(limits[kind], body.joints, strict=True)
-            if (name, kind) not in given
-        ]
+        pairs = zip(limits[kind], body.joints, strict=True)
+        own = [value for value, name in pairs if (name, kind) not in given]
         if len(own) > 2 and len(set(own)) == 1:
             looks = "looks like a default" if own[0] >= size else "may be a default"
-            found.append(
+            yield (
                 f"every joint has the {kind} {own[0]:g} {unit}, which {looks}: look it up in the "
                 f"robot's data sheet"
             )
-    wide = [
-        n for n, r in zip(body.joints, limits["position"], strict=True) if np.ptp(r) > 4 * np.pi
-    ]
-    if wide:
-        found.append(f"the range of {_listed(wide)} is more than two turns: check it")
-    return found
+    dry, viscous = body.model.dof_frictionloss[body.dofs], body.model.dof_damping[body.dofs]
+    for kind, torques in (("frictionloss", dry), ("damping", viscous * limits["velocity"])):
+        tiny = np.flatnonzero((torques > 0.0) & (torques < TINY * limits["torque"]))
+        if tiny.size:
+            yield (
+                f"the {kind} of {listed([body.joints[k] for k in tiny])} is less than "
+                f"{100.0 * TINY:g} % of the limit of torque, and counts as known to about its own "
+                f"size: correct it in the robot's file if it is a default"
+            )
+    ranges = zip(body.joints, limits["position"], strict=True)
+    if wide := [name for name, one in ranges if np.ptp(one) > 4 * np.pi]:
+        yield f"the range of {listed(wide)} is more than two turns: check it"
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} more joints"
+def _beyond(body: Body, limits: Mapping[str, Array], own: Mapping[str, list[Any]]) -> Iterator[str]:
+    """Yield a sentence for each kind of limit that is beyond the one in the robot's file."""
+    for kind in KINDS:
+        names = [
+            name
+            for name, given, limit in zip(body.joints, limits[kind], own[kind], strict=True)
+            if limit is not None
+            and (np.max(given) > np.max(limit) or (kind == "position" and given[0] < limit[0]))
+        ]
+        if names:
+            yield f"the {kind} of {listed(names)} goes beyond the robot's file: check it"
 
 
 def _unlike(source: Path, what: str, value: object, expected: str) -> SpecificationError:

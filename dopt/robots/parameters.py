@@ -246,8 +246,7 @@ class Unknowns:
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
             friction += model.dof_frictionloss[body.dofs] * self._signs(motion)
-            torques = rows @ body.inertial + friction
-            torques += model.dof_armature[body.dofs] * motion.accelerations
+            torques = body.torques(motion, rows) + friction
         for i, one in enumerate(self.parameters):
             if one.kind not in OF_JOINTS:
                 continue
@@ -308,21 +307,16 @@ class Unknowns:
 
 @dataclasses.dataclass(frozen=True)
 class Identifiability:
-    """What an information, (p, p) in relative units, says of the parameters.
+    """What a motion says of the parameters.
 
     Attributes
     ----------
-    errors : (p,)
-        Standard errors as shares of each parameter, given that every parameter is known to about
-        its own size before (a prior standard deviation of 1).
     null : list of str
         Combinations that no motion of this kind changes, in words.
     weak : list of str
         Parameters whose standard error without a prior is above ``WEAK`` of their size.
     """
 
-    names: tuple[str, ...]
-    errors: Array
     null: list[str]
     weak: list[str]
 
@@ -338,8 +332,7 @@ class Identifiability:
             for one, error, is_null in zip(unknowns.parameters, alone, touched, strict=True)
             if error > WEAK and not is_null
         ]
-        errors = relative_errors(rows.T @ rows)
-        return cls(unknowns.names, errors, [_words(row, unknowns) for row in basis], weak)
+        return cls([_words(row, unknowns) for row in basis], weak)
 
 
 def count_null(unknowns: Unknowns, motion: Motion) -> int:

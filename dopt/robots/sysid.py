@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dopt.arguments import within
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body, without_meshes
+from dopt.robots.body import Body, specification
 from dopt.types import Array
 
 if TYPE_CHECKING:
     import mujoco.sysid
 
+NEAR = 5
+"""Rows on each side of the first one of a piece by which its velocities are estimated."""
 
-def sequences(body: Body, log: Any, name: str = "log") -> mujoco.sysid.ModelSequences:
+
+def sequences(
+    body: Body, log: Any, name: str = "log", seconds: float = 1.0
+) -> mujoco.sysid.ModelSequences:
     """Return a log with the specification of its robot, for ``mujoco.sysid.optimize``.
 
     The specification has a motor, which applies the torque, and a sensor of position for each
@@ -29,7 +36,10 @@ def sequences(body: Body, log: Any, name: str = "log") -> mujoco.sysid.ModelSequ
         driven joint, as ``orchestrate design --out`` names them. A torque acts from its row to the
         next.
     name : str
-        Name of the sequence.
+        Name of the sequences.
+    seconds : float
+        Length of the pieces into which the log is cut. Each is simulated from a state of its own:
+        in a long one, errors of measured torques add up to errors of positions.
 
     Raises
     ------
@@ -50,15 +60,22 @@ def sequences(body: Body, log: Any, name: str = "log") -> mujoco.sysid.ModelSequ
     dt = float(steps.mean())
     spec = _measured(body, dt)
     model = spec.compile()
-    state = _first_state(body, model, times, positions)
+    count = max(1, round(len(times) * dt / within("seconds of a piece", seconds, math.inf)))
+    parts = np.array_split(np.arange(len(times)), min(count, len(times) // 2))
     # A rollout stamps what a sensor reads at the beginning of a step with the time of its end.
     return sysid.ModelSequences(
         name,
         spec,
-        name,
-        state,
-        sysid.TimeSeries.from_control_names(times - times[0], torques, model),
-        sysid.TimeSeries.from_names(times - times[0] + dt, positions, model),
+        [f"{name}_{i}" for i in range(len(parts))],
+        [_state(body, model, times, positions, part[0]) for part in parts],
+        [
+            sysid.TimeSeries.from_control_names(times[part] - times[part[0]], torques[part], model)
+            for part in parts
+        ],
+        [
+            sysid.TimeSeries.from_names(times[part] - times[part[0]] + dt, positions[part], model)
+            for part in parts
+        ],
     )
 
 
@@ -87,15 +104,20 @@ def _measured(body: Body, dt: float) -> Any:
             "the robot was not read from a file, but mujoco.sysid needs its specification: read "
             "it by Body.load()."
         )
-    try:
-        spec = mujoco.MjSpec.from_file(str(body.source))
-        spec.compile()
-    except ValueError:
-        spec = without_meshes(body.source)
+    spec, *_ = specification(body.source)
     for part in [*spec.keys, *spec.actuators, *spec.sensors]:
         spec.delete(part)
     spec.option.timestep = dt
-    for joint in body.joints:
+    # What :class:`Body` moved to the joints, from flags and actuators.
+    if body.model.jnt_actgravcomp.any():
+        for part in spec.bodies:
+            part.gravcomp = 0.0
+    for part in spec.joints:
+        part.name = part.name or f"joint{part.id}"
+    for joint, dof in zip(body.joints, body.dofs, strict=True):
+        part, linear = spec.joint(joint), body.model.dof_damping[dof]
+        part.armature = body.model.dof_armature[dof]
+        part.damping = [linear, *part.damping[1:]] if np.ndim(part.damping) else linear
         motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
         spec.add_sensor(
@@ -107,14 +129,19 @@ def _measured(body: Body, dt: float) -> Any:
     return spec
 
 
-def _first_state(body: Body, model: Any, times: Array, positions: Array) -> Array:
-    """Return the state at the first row; velocities by a parabola through the first rows."""
+def _state(body: Body, model: Any, times: Array, positions: Array, row: int) -> Array:
+    """Return the state at a row, by a parabola through the rows about it.
+
+    The engine moves by the velocity after each step: it begins with the one half a step before.
+    """
     from mujoco import sysid
 
-    rows = min(5, len(times))
+    near = slice(max(0, row - NEAR), row + NEAR + 1)
+    t = times[near] - times[row]
+    fit = np.polyfit(t, positions[near], min(2, len(t) - 1))
+    bent = fit[-3] if len(fit) > 2 else 0.0
     qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
-    qpos[body.addresses] = positions[0]
-    fit = np.polyfit(times[:rows] - times[0], positions[:rows], min(2, rows - 1))
-    qvel[body.dofs] = fit[-2]
+    qpos[body.addresses] = fit[-1]
+    qvel[body.dofs] = fit[-2] - bent * model.opt.timestep
     result: Array = sysid.create_initial_state(model, qpos, qvel)
     return result

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 
 import numpy as np
 
-from dopt.robots.body import Body, Contacts
+from dopt.errors import SpecificationError
+from dopt.robots.body import Body, Contacts, KnownBody
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -20,62 +20,14 @@ CORRECTION = 0.5, 0.1
 APART, SEEN = 0.01, 0.03
 """Distance that bodies keep, for errors of tracking, and from which they are looked at [m]."""
 
+SAME = 1e-8
+"""Distance by which bodies that a joint moves together come nearer by rounding alone [m]."""
+
 BRAKING = np.array([[0.25], [0.5], [0.75], [1.0]])
 """Parts of the time of braking after which contacts are looked for."""
 
 TRIED = 0.05
 """Part of a joint's range that it would move alone, after all have braked before a contact."""
-
-
-class KnownBody:
-    """Inverse dynamics of a body at 500 Hz, without friction, contacts and limits.
-
-    Joints that are not driven stay at rest.
-    """
-
-    def __init__(self, body: Body) -> None:
-        import mujoco
-
-        self.body, self.model, self._engine = body, copy.copy(body.model), mujoco
-        self.model.opt.disableflags |= (
-            mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
-        )
-        self.model.dof_damping[:] = 0.0
-        self.model.dof_frictionloss[:] = 0.0
-        self._data = mujoco.MjData(self.model)
-        self._unit, self._column = np.zeros(self.model.nv), np.zeros(self.model.nv)
-
-    def inverse(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the torques [N m], (n,), that accelerate the body so."""
-        data, dofs = self._data, self.body.dofs
-        data.qpos[self.body.addresses] = q
-        data.qvel[dofs] = v
-        data.qacc[dofs] = a
-        self._engine.mj_inverse(self.model, data)
-        return np.array(data.qfrc_inverse[dofs])
-
-    def mass_matrix(self) -> Array:
-        """Return M, (n, n), at the position of the last call of :meth:`inverse`."""
-        dofs = self.body.dofs
-        M = np.empty((len(dofs), len(dofs)))
-        for k, dof in enumerate(dofs):
-            self._unit[dof] = 1.0
-            self._engine.mj_mulM(self.model, self._data, self._column, self._unit)
-            self._unit[dof] = 0.0
-            M[k] = self._column[dofs]
-        return M
-
-    def hang(self, mass: float, moment: Array) -> None:
-        """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
-        model, last = self.model, self.body.moved[-1]
-        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
-        total = own + mass
-        model.body_mass[last] = total
-        model.body_ipos[last] = (own * centre + moment) / total
-        if mass > 0.0:
-            away = moment / mass - centre
-            model.body_inertia[last] += own * mass / total * (away @ away)
-        self._engine.mj_setConst(model, self._data)
 
 
 class Tracker:
@@ -172,14 +124,14 @@ class Guard:
         moved = np.abs(poses - self._poses) @ self._levers
         for k in np.flatnonzero(moved >= self._room):
             room = self._contacts.room(poses[k])
-            if room < 0.0 and room < self._contacts.room(now):
+            if room < 0.0 and room < self._contacts.room(now) - SAME:
                 return False
             self._poses[k], self._room[k] = poses[k], room
         return True
 
     def open(self, q: Array, j: int) -> tuple[bool, bool]:
         """Return whether joint j may move down, and up, from a position, (n,)."""
-        least = min(0.0, self._contacts.room(q))
+        least = min(0.0, self._contacts.room(q)) - SAME
         below, above = (self._contacts.room(q + way * self._step[j]) for way in (-1.0, 1.0))
         return below >= least, above >= least
 
@@ -197,6 +149,12 @@ def possible_acceleration(
     for q in low + (high - low) * random.random((200, n)):
         held = np.abs(known.inverse(q, np.zeros(n), np.zeros(n)))
         own = np.diag(known.mass_matrix())
-        least = np.minimum(least, np.maximum(share * limits.torque - held, 0.0) / own)
+        least = np.minimum(least, (share * limits.torque - held) / own)
         largest = np.maximum(largest, own)
+    if least.min() <= 0.0:
+        raise SpecificationError(
+            f"joint '{known.body.joints[least.argmin()]}' takes more than {100.0 * share:.0f} % of "
+            f"its limit of torque at rest, at some positions in the ranges that are given: give "
+            f"smaller ranges, or a larger limit of torque."
+        )
     return least, largest

@@ -151,8 +151,8 @@ class Run:
 def _checked_model(system: MuJoCo) -> mujoco.MjModel:
     """Return the model of a system, or raise SpecificationError if it is not as declared."""
     try:
-        model = type(system).load()
         log_warnings()
+        model = type(system).load()
     except ModuleNotFoundError as error:
         raise SpecificationError(f"env '{system.name}' {MISSING}") from error
     n, name = system.n_states // 2, system.name

@@ -13,12 +13,12 @@ import numpy as np
 
 from orchestrate.commands import Command, answer
 from orchestrate.errors import ExitCode
-from orchestrate.files import whole
+from orchestrate.files import make_folder, whole
 from orchestrate.program import UsageError, integer, path, positive, tell
 
 if TYPE_CHECKING:
     from dopt.robots.body import Body, Motion
-    from dopt.robots.design import Design, Problem
+    from dopt.robots.design import Candidate, Design, Problem
     from dopt.robots.limits import Limits
 
 SHOWN = 20
@@ -119,19 +119,19 @@ def _check(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]
     from dopt.robots.design import multisine
 
     best = multisine(problem, np.random.default_rng(arguments.seed))
-    document = head | _told(problem, best.motion(1.0 / arguments.rate), best.errors)
+    document = head | _told(problem, best)
+    if obstacle := problem.obstacle(best):
+        document["notes"].append(f"the best multisine breaks limits: {obstacle}")
     how = f"by the best of {document['motions']} random multisines of {problem.seconds:g} s"
     return answer(arguments, document, "\n".join([*_said(document), *_expected(document, how)]))
 
 
-def _told(problem: Problem, motion: Motion, errors: np.ndarray) -> dict[str, Any]:
+def _told(problem: Problem, best: Candidate) -> dict[str, Any]:
     """Return what a motion says of the parameters."""
-    from dopt.robots.design import COARSE, REFERENCES
+    from dopt.robots.design import REFERENCES
     from dopt.robots.parameters import Identifiability
 
-    found = Identifiability.of(
-        problem.unknowns, motion.every(max(1, round(COARSE / motion.dt))), problem.rate
-    )
+    found = Identifiability.of(problem.unknowns, best.motion(problem.step), problem.rate)
     return {
         "motions": REFERENCES,
         "seconds": problem.seconds,
@@ -145,7 +145,7 @@ def _told(problem: Problem, motion: Motion, errors: np.ndarray) -> dict[str, Any
                 "half_width": 1.96 * float(error) * one.scale,
                 "relative": 1.96 * float(error),
             }
-            for one, error in zip(problem.requested, errors, strict=True)
+            for one, error in zip(problem.requested, best.errors, strict=True)
         ],
     }
 
@@ -163,7 +163,11 @@ def _listed(items: list[str], what: str) -> list[str]:
     if not items:
         return [f"no {what}"]
     more = [f"  and {len(items) - SHOWN} more (--json)"] if len(items) > SHOWN else []
-    return [f"{len(items)} {what}:", *(f"  {item}" for item in items[:SHOWN]), *more]
+    return [
+        f"{len(items)} {what if len(items) > 1 else what.replace('s ', ' ', 1)}:",
+        *(f"  {item}" for item in items[:SHOWN]),
+        *more,
+    ]
 
 
 def _expected(document: dict[str, Any], how: str) -> list[str]:
@@ -190,6 +194,8 @@ def _expected(document: dict[str, Any], how: str) -> list[str]:
 def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]) -> ExitCode:
     from dopt.robots.design import Design
 
+    for target in filter(None, (arguments.out, arguments.ros)):  # before minutes of search
+        make_folder(target.parent)
     design = Design.of(
         problem,
         seed=arguments.seed,
@@ -197,7 +203,7 @@ def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any
         progress=lambda line: tell(sys.stderr, f"{line}\n"),
     )
     motion = design.best.motion(1.0 / arguments.rate)
-    document = head | _told(problem, motion, design.best.errors)
+    document = head | _told(problem, design.best)
     document |= {"best": design.best.name, "candidates": _candidates(design), "gap": design.gap}
     document["limits"] = problem.limits.shares(motion) | {"torque": problem.strain(motion)}
     written = []

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import savgol_filter
 
-from dopt.robots.body import Body, Motion
+from dopt.robots.body import Body, KnownBody, Motion
 from dopt.robots.design import COARSE, Design, Problem
 from dopt.robots.limits import Limits
 from dopt.robots.parameters import SLOW, Identifiability, relative_errors
-from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.tracking import Tracker, possible_acceleration
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, LIMITS, Friction, SimulatedRobot, iiwa, jaco
 

@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from dopt.robots.body import Body, Motion
+from dopt.robots.body import Body, KnownBody, Motion
 from dopt.robots.design import Problem, searched
 from dopt.robots.design import multisine as multisine_of
 from dopt.robots.explorer import RobotExplorer
 from dopt.robots.friction import SPEEDS, FrictionLearner
 from dopt.robots.limits import Limits
-from dopt.robots.tracking import KnownBody, Tracker, possible_acceleration
+from dopt.robots.tracking import Tracker, possible_acceleration
 from dopt.robots.trajectories import Family, Fourier, Ladder, Multisine
 from dopt.robots.windows import window_size
 from dopt.types import Array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, Motion
-from dopt.robots.limits import Limits
+from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Identifiability, Unknowns, relative_errors
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
@@ -101,7 +102,7 @@ def inverse(body: Body, motion: Motion, model: object = None) -> np.ndarray:
 def test_torques_are_those_of_the_engine(arm: Body) -> None:
     assert arm.joints == ("turn", "slide", "lift", "roll")
     assert arm.bodies == ("base", "link", "hand")
-    assert "joints without an actuator, which stay where the file puts them: 1" in arm.notes
+    assert arm.notes == ("left out: joints that stay in their place: joint4 (free)",)
     for body in (arm, jaco()):
         damping = body.model.dof_damping.copy()
         motion = random_motion(body.n)
@@ -110,6 +111,45 @@ def test_torques_are_those_of_the_engine(arm: Body) -> None:
         body.model.dof_damping[:] = damping
         scale = np.abs(expected).max()
         np.testing.assert_allclose(body.torques(motion), expected, atol=1e-12 * scale)
+
+
+TWO = """
+<mujoco><option %s</option><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0" %s/>
+<geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.04" mass="3" fluidshape="ellipsoid"/>
+<body name="b" pos="0.4 0 0" gravcomp="0.7"><joint name="b" axis="0 1 0.2" %s/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="2"/></body></body></worldbody>
+<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed></tendon>
+<actuator><motor joint="a" gear="2" %s/><motor joint="b"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ('><flag gravity="disable"/>', "", "", ""),
+        ('><flag invdiscrete="enable"/>', 'armature="0.2"', "", ""),
+        ('density="1000" viscosity="3">', "", "", ""),
+        (">", 'actuatorgravcomp="true"', 'actuatorgravcomp="true"', ""),
+        (">", 'stiffness="4"', 'stiffness="3" springref="20" ref="10"', ""),
+        ('><flag spring="disable"/>', 'stiffness="4"', "", ""),
+        (">", 'damping="0.2 0.3" frictionloss="0.4"', 'damping="2"', ""),
+        (">", 'armature="0.1"', "", 'armature="0.3" damping="0.4"'),
+    ],
+)
+def test_torques_know_what_a_file_switches_off_and_adds(parts: tuple[str, ...]) -> None:
+    """The engine's, less what the same model without damping lacks."""
+    try:
+        raw = mujoco.MjModel.from_xml_string(TWO % parts)
+    except ValueError as error:  # actuators' armature, and damping of higher order
+        pytest.skip(f"needs a newer MuJoCo: {error}")
+    for name in ("dof_damping", "dof_dampingpoly", "actuator_damping"):
+        if hasattr(raw, name):
+            getattr(raw, name)[:] = 0.0
+    raw.opt.enableflags = 0
+    body, motion = body_of(TWO % parts), random_motion(2)
+    expected = inverse(body, motion, raw)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(body.torques(motion), expected, atol=1e-12 * scale)
 
 
 @pytest.mark.parametrize("name", ["mass", "com", "inertia", "armature", "damping"])
@@ -216,6 +256,22 @@ def test_limits_come_from_the_file_then_the_robot(limits: Limits) -> None:
     np.testing.assert_allclose(limits.position[1], [-0.3, 0.3])
 
 
+def test_friction_that_looks_like_a_default_is_said(arm: Body, tmp_path: Path) -> None:
+    """Of a torque of 10 N m, at 2 rad/s: a damping of 0.004 N m s/rad is 0.08 %."""
+    arm.model.dof_damping[arm.dofs] = [0.0, 0.0, 0.004, 0.02]
+    said, *others = limits_of(arm, tmp_path, LIMITS).notes
+    assert said.startswith("the damping of lift is less than 0.1 % of the limit of torque")
+    assert not others
+
+
+def test_limits_beyond_the_file_are_said(arm: Body, tmp_path: Path) -> None:
+    wide = "turn: {position: [-2.1, 2]}, slide: {position: 0.3, torque: 61}, lift: {torque: 9}"
+    assert limits_of(arm, tmp_path, f"joints: {{default: {{velocity: 2}}, {wide}}}").notes[:2] == (
+        "the position of turn goes beyond the robot's file: check it",
+        "the torque of slide goes beyond the robot's file: check it",
+    )
+
+
 def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
     joints = "".join(
         f"""<link name="l{i + 1}"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1"
@@ -253,7 +309,7 @@ def test_limits_that_are_wrong_are_named(arm: Body, tmp_path: Path, text: str, s
 
 
 def test_missing_limits_are_named_at_once_with_the_lines_to_fill_in(arm: Body) -> None:
-    with pytest.raises(SpecificationError, match="velocity of turn and 3 more joints") as error:
+    with pytest.raises(SpecificationError, match="velocity of turn and 3 more\\. Fill") as error:
         Limits.of(arm)
     lines = str(error.value).partition("\n")[2]
     assert lines == "joints:\n  default: {velocity: …}"
@@ -285,11 +341,17 @@ def test_wrong_parameters_are_named(arm: Body, limits: Limits, wanted: str, said
         Unknowns(arm, limits, wanted)
 
 
+FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>
+<link name="b"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="3" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("<mujoco><worldbody/></mujoco>", "no hinge or slide"),
         ("<mujoco><worldbody>", "cannot be read"),
+        (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
         ("", "robot.xml"),
     ],
 )
@@ -308,6 +370,23 @@ FOLD = """<mujoco><worldbody><geom name="wall" type="plane" size="1 1 1"/>
 def test_collisions_are_found_and_contacts_at_home_are_not() -> None:
     touching = body_of(FOLD).collisions(np.array([[0.0], [1.4], [-1.4]]))
     assert touching == [(1, "world", "arm")]  # the axis turns it down
+
+
+def test_home_is_within_the_ranges_and_what_touches_there_is_named() -> None:
+    """At 0, out of its range, the forearm is in the base; in the middle of the range it is not."""
+    text = """<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1"/>
+        <body pos="0 0 0.3"><joint axis="0 1 0" range="-90 90"/>
+        <geom size="0.02"/><body name="fore"><joint axis="0 1 0" range="{}"/>
+        <geom type="capsule" fromto="0 0 -0.2 0 0 -0.4" size="0.02"/></body></body></worldbody>
+        </mujoco>"""
+    away, within = body_of(text.format("90 270")), body_of(text.format("-90 90"))
+    np.testing.assert_allclose(away.home, [0.0, np.pi])
+    assert away.notes == ()
+    assert [pair for _, *pair in away.collisions(np.zeros((1, 2)))] == [["world", "fore"]]
+    assert within.notes == (
+        "left out: contacts of bodies that touch where the file puts them: world and fore",
+    )
+    assert within.collisions(np.zeros((1, 2))) == []
 
 
 def test_room_is_the_distance_beyond_the_one_to_keep() -> None:
@@ -343,3 +422,111 @@ except SpecificationError as error:
     command = [sys.executable, "-c", text, tmp_path / "arm.xml"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout
+
+
+def test_meshes_that_are_not_there_are_said(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        """<mujoco><asset><mesh name="m" file="parts/link.stl"/></asset><worldbody>
+        <body><joint name="a"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+        <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+    )
+    body = Body.load(tmp_path / "arm.xml")
+    said = "left out: meshes and their contacts, for one is not there: link.stl"
+    assert (body.model.ngeom, body.notes) == (0, (said,))
+
+
+def test_a_file_that_the_engine_warns_of_writes_nothing(tmp_path: Path) -> None:
+    text = ARM.replace('angle="radian"', 'angle="radian" settotalmass="7"')
+    (tmp_path / "arm.xml").write_text(text)
+    code = "from dopt.robots import Body; print(*Body.load('arm.xml').joints)"
+    path = {"PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "turn slide lift roll\n"
+    assert [one.name for one in tmp_path.iterdir()] == ["arm.xml"]
+
+
+def test_what_is_left_out_is_named() -> None:
+    body = body_of(
+        """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
+        <body><freejoint name="root"/><geom size="0.1"/>
+        <body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+        <body><joint name="b" axis="0 1 0"/><geom size="0.1"/>
+        <body><joint name="c" type="ball"/><geom size="0.1"/>
+        </body></body></body></body></worldbody>
+        <tendon><fixed name="rope" frictionloss="1"><joint joint="b" coef="1"/></fixed></tendon>
+        <equality><joint name="mimic" joint1="b" joint2="a"/></equality>
+        <actuator><motor joint="a"/><motor name="pull" tendon="rope"/></actuator></mujoco>"""
+    )
+    assert body.joints == ("a",)
+    assert body.notes == (
+        "left out: joints that stay in their place: root (free), b, c",
+        "left out: actuators that move no hinge or slide alone: pull",
+        "left out: equality constraints: mimic",
+        "left out: dry friction of tendons: rope",
+    )
+
+
+def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:
+    joint = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{0}"/>
+      <axis xyz="0 1 0"/><limit lower="0" upper="0.04" effort="20" velocity="0.2"/>{2}</joint>"""
+    link = """<link name="{0}"><inertial><mass value="0.1"/>
+      <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+    links = "".join(link.format(name) for name in ("hand", "left", "right"))
+    mimic = joint.format("right", "hand", '<mimic joint="left" multiplier="-1"/>')
+    (tmp_path / "gripper.urdf").write_text(
+        f'<robot name="r">{links}{joint.format("left", "hand", "")}{mimic}</robot>'
+    )
+    body = Body.load(tmp_path / "gripper.urdf")
+    assert body.joints == ("left",)
+    assert body.notes[0] == "left out: joints that stay in their place: right"
+    limits = Limits.of(body)
+    assert (limits.torque, limits.velocity) == ([20.0], [0.2])
+    text = (tmp_path / "gripper.urdf").read_text()
+    (tmp_path / "gripper.urdf").write_text(f'\n<?xml version="1.0"?>{text}')
+    assert Limits.of(Body.load(tmp_path / "gripper.urdf")).velocity == [0.2]
+    (tmp_path / "gripper.urdf").write_text(text.replace("</robot>", "<a:b/></robot>"))
+    with pytest.raises(SpecificationError, match="velocity of left"):
+        Limits.of(Body.load(tmp_path / "gripper.urdf"))
+
+
+def test_limits_of_joints_without_names_and_of_actuators_with_two_limits(tmp_path: Path) -> None:
+    """A joint's torque is what its control, its force and the joint itself allow, all of them."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint/><geom size="0.1"/>
+        <body><joint name="b"/><geom size="0.1"/>
+        <body><joint name="c" actuatorfrcrange="-5 5"/><geom size="0.1"/></body></body></body>
+        </worldbody><actuator><motor joint="b" gear="50" ctrlrange="-1 1" forcerange="-100 100"/>
+        <position joint="c" kp="9" forcerange="-2 2" gear="2" ctrlrange="-1 1"/></actuator>
+        </mujoco>"""
+    )
+    given = "joints: {default: {position: 1, velocity: 2}}"
+    np.testing.assert_array_equal(limits_of(body, tmp_path, given).torque, [50.0, 4.0])
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint/><geom size="0.1"/></body></worldbody></mujoco>"""
+    )
+    found = limits_of(Body(model), tmp_path, given.replace("2", "2, torque: 3"))
+    assert Body(model).joints == ("joint0",)
+    assert found.torque == [3.0]
+
+
+def test_a_joint_that_cannot_carry_its_weight_is_named(tmp_path: Path) -> None:
+    body = body_of(
+        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" range="0 1"/>
+        <geom size="0.1" mass="6"/><body><joint name="arm" axis="0 1 0" range="70 115"/>
+        <geom size="0.1" pos="0 0 1" mass="3"/></body></body></worldbody></mujoco>"""
+    )
+    given = "joints: {default: {velocity: 1}, arm: {torque: %s}, z: {torque: %s}}"
+    for arm, slide, said in (
+        (99, 80, "'z' takes 88.3 N at rest.*limit of torque is 80 N"),
+        (20, 99, "'arm' takes 26.* N m at rest.*limit of torque is 20 N m: give"),
+    ):
+        with pytest.raises(SpecificationError, match=said):
+            check_weight(body, limits_of(body, tmp_path, given % (arm, slide)))
+    check_weight(body, limits_of(body, tmp_path, given % (29, 99)))

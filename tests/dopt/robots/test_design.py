@@ -219,6 +219,13 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
     fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False)
     assert fitted["a"].value == pytest.approx(0.8, rel=0.02)
     assert fitted["b"].value == pytest.approx(0.3, rel=0.02)
+    pieces = sequences(body, log, seconds=0.2)
+    assert [len(one.times) for one in pieces.control] == [100] * 7
+    for k, state in enumerate(pieces.initial_state):
+        rate = (q[100 * k] - q[100 * k - 1]) / 0.002 if k else np.zeros(2)
+        atol = 3e-3 if k else 0.1  # on one side of the first row alone
+        np.testing.assert_allclose(state[1:5], [*q[100 * k], *rate], atol=atol)
+        np.testing.assert_array_equal(pieces.sensordata[k].data, q[100 * k : 100 * (k + 1)])
     for broken, said in (
         (log.drop(columns="q_a"), "no column 'q_a'"),
         (log.assign(tau_b=np.nan), "not finite"),
@@ -226,3 +233,23 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
     ):
         with pytest.raises(SpecificationError, match=said):
             sequences(body, broken)
+
+
+def test_what_stands_against_every_motion_is_named(tmp_path: Path) -> None:
+    """A slide holds its weight at rest, and not while it moves against friction; and a wall."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" range="0 1"
+        frictionloss="20"/><geom size="0.1" mass="6"/></body></worldbody></mujoco>"""
+    )
+    limits = limits_of(body, tmp_path, "joints: {z: {velocity: 1, torque: 70}}")
+    problem = Problem(body, limits, "damping", 3.0, nuisance="")
+    with pytest.raises(
+        SpecificationError, match=r"in the best one, joint 'z' takes [0-9.]+ of 70 N\)"
+    ):
+        Design.of(problem, effort=24)
+    fold = body_of(FOLD)
+    given = "joints: {hinge: {position: [1.0, 1.5], velocity: 1, torque: 70}}"
+    problem = Problem(fold, limits_of(fold, tmp_path, given), "damping", 3.0)
+    assert problem.obstacle(multisine(problem, np.random.default_rng(0))) == (
+        "the bodies world and arm touch"
+    )

@@ -1,7 +1,9 @@
 """Explorer of robots with a known body: limits, stops, payloads, and bad measurements."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +19,7 @@ from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard
 from studies.robots.online import LOOK, Trace, explore, true_values
 from studies.robots.simulated import SimulatedRobot, jaco
+from tests.dopt.robots.test_body import body_of, limits_of
 
 Arm = Callable[[], tuple[Body, Limits]]
 
@@ -130,6 +133,27 @@ def test_geoms_that_cannot_collide_are_not_looked_at() -> None:
     guard = Guard(Body(mujoco.MjModel.from_xml_string(text)), limits, limits.acceleration)
     assert not guard.needed
     assert guard.free(np.zeros(3), limits.velocity, np.zeros(3))
+
+
+def test_a_joint_that_moves_two_near_bodies_together_is_free(tmp_path: Path) -> None:
+    """Their distance changes by rounding alone, which once kept a robot in its place for ever."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint name="turn" axis="0.3 0.2 1" range="-170 170"/>
+        <geom size="0.01" contype="0" conaffinity="0"/>
+        <body pos="0.2 0.1 0"><joint name="a" type="slide" axis="1 0.5 0" range="-0.2 0.2"/>
+        <geom size="0.07"/></body>
+        <body pos="0.1 0.3 0.1"><joint name="b" type="slide" axis="0 1 0" range="-0.2 0.2"/>
+        <geom size="0.07"/></body></body></worldbody></mujoco>"""
+    )
+    limits = limits_of(body, tmp_path, "joints: {default: {velocity: 1, torque: 50}}")
+    guard, v = Guard(body, limits, np.ones(3)), np.array([0.1, 0.0, 0.0])
+    near = np.array([0.0, 0.0, -0.18])
+    assert -0.01 < guard._contacts.room(near) < 0.0
+    for turn in np.linspace(-2.5, 2.5, 200):
+        now = near + np.array([turn, 0.0, 0.0])
+        assert guard.free(now + 0.002 * v, v, now)
+        assert guard.open(now, 0) == (True, True)
+    assert not guard.free(near, np.array([0.0, 0.0, -0.1]), near)
 
 
 def test_friction_is_learned_beside_a_wall() -> None:
@@ -295,3 +319,10 @@ def test_bad_arguments_are_refused_with_a_remedy() -> None:
         explorer.ask(np.full(3, np.nan))
     with pytest.raises(SpecificationError, match="3 real numbers"):
         explorer.ask(np.zeros(2))
+
+
+def test_a_robot_that_its_torques_hardly_carry_is_refused() -> None:
+    body, limits = small()
+    weak = dataclasses.replace(limits, torque=0.01 * limits.torque)
+    with pytest.raises(SpecificationError, match="more than 70 % of its limit of torque at rest"):
+        RobotExplorer(body, weak)

@@ -169,6 +169,19 @@ def test_the_seed_decides_about_the_start_and_policies_share_it() -> None:
     assert first[0, 1] == 0
 
 
+def test_warnings_while_a_model_is_read_are_logged() -> None:
+    """The engine would write them into a file in the working folder."""
+
+    class Warned(Block):
+        @classmethod
+        def load(cls) -> mujoco.MjModel:
+            assert mujoco.get_mju_user_warning() is not None
+            return super().load()
+
+    mujoco.set_mju_user_warning(None)
+    assert np.isfinite(Warned().episode(0).state).all()
+
+
 def test_a_model_of_a_users_own_is_explored() -> None:
     system = Block()
     spec = specification()

@@ -99,3 +99,23 @@ def test_wrong_inputs_are_one_sentence(
     captured = capsys.readouterr()
     assert said in captured.err
     assert "Traceback" not in captured.err
+
+
+def test_a_folder_that_cannot_be_written_is_said_before_the_search(
+    robot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = designed(robot, "--unknown", "damping", "--out", str(robot / "motion.csv"))
+    assert code != ExitCode.DONE
+    assert "cannot be written" in capsys.readouterr().err
+    assert designed(robot, "--unknown", "damping", "--ros", str(robot / "motion.yaml")) == code
+    assert "multisine" not in capsys.readouterr().err
+
+
+def test_slow_sensors_hide_no_parameter_and_short_motions_have_rows(
+    robot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What no motion can tell is a property of the robot, not of the rows of a measurement."""
+    words = ["--unknown", "all", "--json"]
+    assert designed(robot, *words, "--check", "--rate", "0.5") == ExitCode.DONE
+    assert len(json.loads(capsys.readouterr().out)["null"]) == 10
+    assert designed(robot, *words, "--seconds", "0.05", "--effort", "24") == ExitCode.DONE
