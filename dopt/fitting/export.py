@@ -274,7 +274,8 @@ def _simulated(found: Any) -> tuple[Integers, Array, Array]:
         part = states[first : last + 1]
         new = np.isnan(part).all(axis=1)
         part[new] = simulator.states(solution.p, first, last, start)[new]
-    errors = (data.measured - states[:, model.structure.measured]) / data.deviations
+    errors = data.measured - states[:, model.structure.measured]
+    errors /= np.array([*found.noise.values()])
     rows = np.flatnonzero(np.isfinite(errors).any(axis=1) & np.isfinite(states).all(axis=1))
     return rows, states[rows], np.sqrt(np.nanmean(np.square(errors[rows]), axis=1))
 

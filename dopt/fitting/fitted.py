@@ -22,6 +22,7 @@ from dopt.fitting.problem import (
     errors_ahead,
     first_states,
     horizon_errors,
+    left_over,
     linear_predictions,
     predicted,
     prediction_rows,
@@ -89,7 +90,7 @@ class Fitted:
     chosen, physics : Estimate
         What was chosen, and the fit of the constants without a network; the same if it was refused.
     data : Data
-        Rows of all logs, and the standard deviations of what the constants leave.
+        Rows of all logs, and the standard deviations by which they were weighed.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class Fitted:
     ) -> None:
         self.plant, self.hold, self.selection, self.tests = plant, hold, selection, list(tests)
         self.data, self.chosen, self.physics = data, chosen, physics
+        self._deviations = left_over(data, chosen.model, chosen.solution)
         self._held_out = dict(held_out)
         self.has_network = chosen is not physics
         if {"delay", "lag"} <= {*physics.model.names[physics.model.n_named :]}:
@@ -162,7 +164,7 @@ class Fitted:
     def noise(self) -> dict[str, float]:
         """Standard deviation of what the model leaves of each measured state, in its unit."""
         names = measured_names(self.plant)
-        return dict(zip(names, map(float, self.data.deviations), strict=True))
+        return dict(zip(names, map(float, self._deviations), strict=True))
 
     def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike) -> Array:
         """Return dx/dt, (N, d), at states, (N, d), under inputs that act there, (N, m)."""
@@ -234,8 +236,7 @@ class Fitted:
 
         Before the first horizon they are the noise, and beyond the last one they stay.
         """
-        found, noise = self._held_out["model"], self.data.deviations
-        return errors_ahead(found, self.horizons, seconds, noise)
+        return errors_ahead(self._held_out["model"], self.horizons, seconds, self._deviations)
 
     @property
     def horizons(self) -> list[float]:
@@ -258,7 +259,7 @@ class Fitted:
 
     @functools.cached_property
     def _tested(self) -> dict[str, list[Predicted]]:
-        data = data_of(self.plant, self.tests, self.hold, self.data.deviations)
+        data = data_of(self.plant, self.tests, self.hold, self._deviations)
         history = 0.5 * self.selection.window
         rows = prediction_rows(
             *(data, (0, len(data.time) - 1), history, max(self.horizons)),
@@ -282,11 +283,11 @@ class Fitted:
         from scipy.stats import norm
 
         z, parts = float(norm.ppf(0.5 + 0.5 * level)), self._held_out["model"]
-        held = np.zeros((2, len(self.data.deviations)))  # inside, and all
+        held = np.zeros((2, len(self._deviations)))  # inside, and all
         for i, part in enumerate(parts):
             others = [each for j, each in enumerate(parts) if j != i]
             for seconds, error, change in zip(part.seconds, part.errors, part.changes, strict=True):
-                bound = z * errors_ahead(others, self.horizons, seconds, self.data.deviations)
+                bound = z * errors_ahead(others, self.horizons, seconds, self._deviations)
                 seen = np.isfinite(change)
                 held += (seen & (np.abs(error) <= bound)).sum(axis=0), seen.sum(axis=0)
         with np.errstate(invalid="ignore"):
@@ -438,7 +439,7 @@ class Fitted:
 
     def _with(self, run: Any) -> Data:
         log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
-        return data_of(self.plant, [log], self.hold, self.data.deviations)
+        return data_of(self.plant, [log], self.hold, self._deviations)
 
     def _whole(self, data: Data, history: float) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""

@@ -26,10 +26,11 @@ from numba import types
 from scipy.linalg import blas, cho_factor, cho_solve
 
 from dopt.fitting import simulation
-from dopt.fitting.model import Model
+from dopt.fitting.model import Model, measured_names
 from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
+from dopt.systems.plant import Encoder
 from dopt.types import Array, Booleans, Integers
 
 BATCH_ROWS = 1200
@@ -362,6 +363,19 @@ def _kind(value: Any) -> Any:
     if isinstance(value, int | np.integer):
         return types.int64
     return types.float64 if isinstance(value, float) else numba.typeof(value)
+
+
+def left_over(data: Data, model: Model, found: Solution) -> Array:
+    """Return the standard deviation of each measured state from what a fit has left, (n,)."""
+    residuals = Simulator(model, data).residuals(found.p, found.windows)
+    typical = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
+    floors = []
+    for name, column in zip(measured_names(model.plant), data.measured.T, strict=True):
+        noise = model.plant.measured.get(name)
+        rounded = 1e-9 * max(float(np.nanstd(column)), 1e-300)
+        floors.append(noise.noise if isinstance(noise, Encoder) else rounded)
+    left: Array = data.deviations * np.maximum(typical, np.array(floors) / data.deviations)
+    return left
 
 
 def windows_of(

@@ -376,7 +376,7 @@ def test_units_of_a_state_do_not_matter() -> None:
         ({"weights": (0.0,), "width": 4}, "weights is"),
         ({"workers": 0}, "workers is 0"),
         ({"logs": []}, "no log was given"),
-        ({"logs": run(0, 6)[:2]}, "longest piece"),
+        ({"logs": run(0, 6)[:2]}, "longest piece of a block, of 2 that"),
         ({"logs": run(0, 6)[["time", "angle"]]}, "voltage"),
         ({"plant": {}}, r"dopt\.Plant is expected"),
     ],
@@ -385,6 +385,20 @@ def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) 
     given = {"plant": declared(), "logs": run(0, 60), "width": 0} | arguments
     with pytest.raises(SpecificationError, match=said):
         dopt.fit(**given)  # type: ignore[arg-type]
+
+
+def test_stamps_in_another_unit_are_refused() -> None:
+    """They were integrated in steps of the plant's dt, for hours."""
+    table = run(0, 60)
+    for scale in (1e3, 1e-3, 1e9):
+        with pytest.raises(SpecificationError, match=r"the plant's dt of 0.02.*units={'time'"):
+            dopt.fit(declared(), table.assign(time=scale * table.time), width=0)
+
+
+def test_steps_that_are_too_long_are_said(fitted: Fitted) -> None:
+    found = dopt.fit(declared(dt=0.12), run(0)[::6], width=0)
+    assert "steps of 0.12 s are too long for these equations" in found.report()
+    assert "too long" not in fitted.report()
 
 
 def test_a_plant_without_unknowns_gets_a_network_alone() -> None:
