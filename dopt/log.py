@@ -82,7 +82,8 @@ def columns_of(data: Any, names: Sequence[str] | None = None) -> dict[str, npt.N
     else:
         raise SpecificationError(
             f"the data of a log is of the type {type(data).__name__}, but a DataFrame, a mapping "
-            f"of names to columns, or an array with 'columns' is expected: give one."
+            f"of names to columns, or an array with 'columns' is expected: give one, of a file by "
+            f"analysis.log_report.read_table."
         )
     shapes = {name: values.shape for name, values in table.items()}
     if len(set(shapes.values())) != 1 or any(len(s) != 1 or s == (0,) for s in shapes.values()):

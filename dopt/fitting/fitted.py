@@ -260,11 +260,11 @@ class Fitted:
     @functools.cached_property
     def _tested(self) -> dict[str, list[Predicted]]:
         data = data_of(self.plant, self.tests, self.hold, self._deviations)
-        history = 0.5 * self.selection.window
+        history, skip, ahead = 0.5 * self.selection.window, self._latest(), 2.0 * self.plant.dt
+        longest = float((data.time[data.lasts] - data.time[data.firsts]).max())
+        horizon = min(max(self.horizons), longest - history - skip - ahead - 2.0 * self.plant.dt)
         rows = prediction_rows(
-            *(data, (0, len(data.time) - 1), history, max(self.horizons)),
-            skip=self._latest(),
-            ahead=2.0 * self.plant.dt,
+            data, (0, len(data.time) - 1), history, horizon, skip=skip, ahead=ahead
         )
         models = {"model": self.chosen, "physics alone": self.physics}
         found = {
@@ -278,7 +278,7 @@ class Fitted:
     def coverage(self, level: float = 0.9) -> dict[str, float]:
         """Return the share of held-out measurements within the bounds of predictions at a level.
 
-        The bounds come from the errors of the other blocks.
+        The bounds come from the errors of the other blocks; NaN with a single one.
         """
         from scipy.stats import norm
 
@@ -287,6 +287,8 @@ class Fitted:
         for i, part in enumerate(parts):
             others = [each for j, each in enumerate(parts) if j != i]
             for seconds, error, change in zip(part.seconds, part.errors, part.changes, strict=True):
+                if not others:
+                    break
                 bound = z * errors_ahead(others, self.horizons, seconds, self._deviations)
                 seen = np.isfinite(change)
                 held += (seen & (np.abs(error) <= bound)).sum(axis=0), seen.sum(axis=0)
@@ -325,6 +327,8 @@ class Fitted:
     def verdict(self) -> str:
         """Return in a sentence how far ahead the model is worth using."""
         useful, longest = self._useful()
+        if not longest:
+            return "Not judged: the runs for validation are shorter than what is to be predicted."
         if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
         if useful < longest:
@@ -374,7 +378,8 @@ class Fitted:
                 )
         lines.append("")
         for name, share in self.coverage().items():
-            lines.append(f"Bounds of 90 % hold {100 * share:.0f} % of held-out {name}.")
+            told = "are not judged on" if math.isnan(share) else f"hold {100 * share:.0f} % of"
+            lines.append(f"Bounds of 90 % {told} held-out {name}.")
         for name, (own, other) in self.whiteness().items():
             lines.append(
                 f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with "

@@ -387,6 +387,17 @@ def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) 
         dopt.fit(**given)  # type: ignore[arg-type]
 
 
+def test_short_runs_are_judged_as_far_as_they_go() -> None:
+    """A block alone has no other ones that bound it; a run of one window is predicted."""
+    other = run(1)
+    found = dopt.fit(declared(), [run(0), other[:30], other[30:60]], width=0)
+    assert np.isnan(found.coverage()["angle"])
+    assert "Bounds of 90 % are not judged on held-out angle" in found.report()
+    for rows, words in ((60, "Useful up to 0.6 s"), (15, "Not judged: the runs for validation")):
+        short = dopt.fit(declared(), run(0), width=0, window=0.6, validate=other[:rows])
+        assert short.verdict().startswith(words)
+
+
 def test_stamps_in_another_unit_are_refused() -> None:
     """They were integrated in steps of the plant's dt, for hours."""
     table = run(0, 60)
