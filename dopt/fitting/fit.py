@@ -28,7 +28,7 @@ import numpy as np
 from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
-from dopt.fitting.model import Layout, Model, data_of, measured_names
+from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import (
     HORIZONS,
     Predicted,
