@@ -632,7 +632,7 @@ def _unwrapped(
     """Return an angle that is followed over the ends of a turn within each piece."""
     used = angle[np.concatenate(pieces)]
     used = used[np.isfinite(used)]
-    span = float(np.ptp(used)) if used.size else 0.0
+    span = float(np.ptp(np.quantile(used, (0.001, 0.999)))) if used.size else 0.0  # but glitches
     if span > _ONE_TURN:
         notes.append(f"Angle {name!r} counts turns ({span / TURN:.3g} of them): it is kept.")
         return angle

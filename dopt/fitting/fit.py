@@ -78,7 +78,7 @@ MOST_SCANNED = 150
 ROWS_SCANNED = 8000
 """Rows of these windows."""
 
-STEP_ERROR = 0.2
+STEP_ERROR = 0.3
 """Largest error of the integration that goes unsaid, in standard deviations of what is left."""
 
 

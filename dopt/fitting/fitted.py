@@ -328,7 +328,7 @@ class Fitted:
         """Return in a sentence how far ahead the model is worth using."""
         useful, longest = self._useful()
         if not longest:
-            return "Not judged: the runs for validation are shorter than what is to be predicted."
+            return "Not judged: no run is long enough to be predicted."
         if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
         if useful < longest:

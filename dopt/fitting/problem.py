@@ -471,17 +471,21 @@ class Predicted(NamedTuple):
         )
 
     def at(self, horizon: float) -> tuple[Array, Array]:
-        """Return errors and changes, (windows, n), at the last measurement up to a time."""
-        errors, changes = [], []
-        for seconds, error, change in zip(self.seconds, self.errors, self.changes, strict=True):
-            inside = np.flatnonzero(
-                (seconds <= horizon * (1 + 1e-9)) & np.isfinite(change).all(axis=1)
-            )
-            if len(inside) and seconds[inside[-1]] >= 0.8 * horizon:
-                errors.append(error[inside[-1]])
-                changes.append(change[inside[-1]])
+        """Return errors and changes, (windows, n), at the last measurement up to a time.
+
+        It is NaN of a state that was not measured in the last fifth of the time.
+        """
         n = len(self.deviations)
-        return np.array(errors).reshape(-1, n), np.array(changes).reshape(-1, n)
+        found = np.full((2, len(self.seconds), n), np.nan)
+        for k, (seconds, *both) in enumerate(
+            zip(self.seconds, self.errors, self.changes, strict=True)
+        ):
+            late = (seconds <= horizon * (1 + 1e-9)) & (seconds >= 0.8 * horizon)
+            for c in range(n):
+                for row in np.flatnonzero(late & np.isfinite(both[1][:, c]))[-1:]:
+                    found[:, k, c] = [part[row, c] for part in both]
+        errors, changes = found[:, np.isfinite(found[1]).any(axis=1)]
+        return errors, changes
 
 
 def predicted(simulator: Simulator, p: Array, rows: Integers) -> Predicted:
@@ -547,10 +551,12 @@ def horizon_errors(
         both = [each.at(horizon) for each in found]
         errors = np.concatenate([error for error, _ in both])
         changes = np.concatenate([change for _, change in both])
-        if not len(errors):
+        seen = np.isfinite(changes)
+        if not (len(seen) and seen.any(axis=0).all()):
             continue
         row = []
-        for error, change in zip(errors.T, changes.T, strict=True):
+        for c, here in enumerate(seen.T):
+            error, change = errors[here, c], changes[here, c]
             rms = float(np.sqrt(np.mean(np.square(error))))
             moved = float(np.sqrt(np.mean(np.square(change))))
             row.append(

@@ -201,6 +201,17 @@ def test_an_angle_within_a_turn_is_unwrapped(
     assert said(found, "unwrapped")
 
 
+def test_a_glitch_is_no_turn() -> None:
+    """One value beyond a turn left every passage of its end in the angle."""
+    turning = 0.1 * np.arange(3000)
+    angle = (turning + np.pi) % (2 * np.pi) - np.pi
+    angle[1000] = 40.0
+    found = log({"t": 0.01 * np.arange(3000), "th": angle, "u": turning}, angles=["th"])
+    left = np.delete(found.pieces[0].measured[:, 0] - turning, 1000)
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+    assert said(found, "passes its end")
+
+
 def test_counts_become_radians_and_counters_go_on() -> None:
     angle = 30.0 * np.sin(2 * T)
     counts = np.round(angle / TURN * 4096).astype(np.int64)

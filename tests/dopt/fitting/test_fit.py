@@ -387,13 +387,27 @@ def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) 
         dopt.fit(**given)  # type: ignore[arg-type]
 
 
+def test_states_that_are_measured_at_different_times_are_judged() -> None:
+    table = run(0)
+    rate = np.gradient(table.angle, table.time)
+    odd = np.arange(len(table)) % 2 == 1
+    table = table.assign(angle=table.angle.where(~odd), rate=np.where(odd, rate, np.nan))
+    both = {"angle": dopt.encoder(4096), "rate": 0.1}
+    found = dopt.fit(declared(measured=both), table, width=0, window=0.3)
+    rows = [row for row in found.errors() if row["model"] == "model"]
+    assert {row["state"] for row in rows} == {"angle", "rate"}
+    assert {row["windows"] for row in rows[2:]} == {15}
+    assert found.verdict().startswith("Useful up to 1.2 s")
+    assert min(found.coverage().values()) > 0.7
+
+
 def test_short_runs_are_judged_as_far_as_they_go() -> None:
     """A block alone has no other ones that bound it; a run of one window is predicted."""
     other = run(1)
     found = dopt.fit(declared(), [run(0), other[:30], other[30:60]], width=0)
     assert np.isnan(found.coverage()["angle"])
     assert "Bounds of 90 % are not judged on held-out angle" in found.report()
-    for rows, words in ((60, "Useful up to 0.6 s"), (15, "Not judged: the runs for validation")):
+    for rows, words in ((60, "Useful up to 0.6 s"), (15, "Not judged: no run is long")):
         short = dopt.fit(declared(), run(0), width=0, window=0.6, validate=other[:rows])
         assert short.verdict().startswith(words)
 
