@@ -35,6 +35,9 @@ from dopt.types import Array, Integers
 USEFUL = 0.5
 """Largest error of a model that is worth using, by the changes themselves."""
 
+CORRELATED = 0.7
+"""Correlation of residuals with the row before from which the equations lack something."""
+
 TOLD_APART = 0.1
 """Largest standard error of delay and lag that are told apart, by their sizes together."""
 
@@ -380,11 +383,14 @@ class Fitted:
         for name, share in self.coverage().items():
             told = "are not judged on" if math.isnan(share) else f"hold {100 * share:.0f} % of"
             lines.append(f"Bounds of 90 % {told} held-out {name}.")
-        for name, (own, other) in self.whiteness().items():
+        white = self.whiteness()
+        for name, (own, other) in white.items():
             lines.append(
                 f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with "
                 f"an earlier input (0: white)."
             )
+        if self.has_network or any(abs(own) > CORRELATED for own, _ in white.values()):
+            lines.append("The equations lack something, which no standard error above contains.")
         return "\n".join([*lines, self.verdict()])
 
     def store(self, url: str | None = None) -> str:

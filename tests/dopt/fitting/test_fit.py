@@ -271,10 +271,12 @@ def test_a_network_is_refused_where_the_constants_tell_all() -> None:
     found = dopt.fit(declared(), run(5), width=6, weights=(10.0,))
     assert not found.has_network
     assert "no network" in found.report()
+    assert "lack something" not in found.report()
 
 
 def test_a_network_is_kept_where_something_is_not_declared(fitted: Fitted) -> None:
     assert fitted.has_network
+    assert "The equations lack something" in fitted.report()
     rows = [row for row in fitted.errors() if row["horizon"] == max(fitted.horizons[:3])]
     by_model = {row["model"]: row["rms"] for row in rows}
     assert by_model["model"] < 0.7 * by_model["physics alone"] < by_model["linear"]
