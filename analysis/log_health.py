@@ -327,6 +327,9 @@ DIGITS = 1e-7
 FEW = 5
 """Levels below which a signal has no quantum: it is switched."""
 
+MANY = 20
+"""Levels beside which one that is far from all may stand for a missing measurement."""
+
 _BLOCKS = 100  # of a log, in which a signal may rest
 
 
@@ -351,6 +354,8 @@ class Signal:
         Period at which it wraps, NaN for none.
     rests : (100,) array
         Whether it rests in each hundredth of the log.
+    alone : (float, int), optional
+        A value far from all others, and its rows, which the other facts leave out.
     """
 
     name: str
@@ -363,6 +368,7 @@ class Signal:
     at_high: int
     period: float
     rests: Booleans
+    alone: tuple[float, int] | None
 
 
 @dataclass(frozen=True)
@@ -414,6 +420,10 @@ def _signal(name: str, parts: Sequence[Vector]) -> Signal:
     parts = [part[np.isfinite(part)] for part in parts]
     values = np.concatenate(parts)
     levels, counts = _levels(values)
+    alone, without = _alone(levels, counts)
+    if alone is not None:
+        parts = [part[~np.isclose(part, alone[0], rtol=DIGITS, atol=0)] for part in parts]
+        values, (levels, counts) = np.concatenate(parts), without
     step = quantum(levels)
     floor = 0.0 if math.isnan(step) else step / math.sqrt(12.0)
     noise = max(floor, _fast(parts))
@@ -424,7 +434,17 @@ def _signal(name: str, parts: Sequence[Vector]) -> Signal:
     low, high = float(levels[0]), float(levels[-1])
     rests = _rests(values, 4.0 * noise)
     period = _wrap_period(parts, high - low)
-    return Signal(name, low, high, len(levels), step, noise, at_low, at_high, period, rests)
+    facts = (len(levels), step, noise, at_low, at_high, period, rests, alone)
+    return Signal(name, low, high, *facts)
+
+
+def _alone(levels: Vector, counts: Array) -> tuple[tuple[float, int] | None, tuple[Vector, Array]]:
+    """Return a value beyond all others by more than their range, its rows, and the other levels."""
+    for at, rest in ((0, slice(1, None)), (-1, slice(-1))):
+        others = levels[rest]
+        if len(others) > MANY and np.abs(others - levels[at]).min() > np.ptp(others):
+            return (float(levels[at]), int(counts[at])), (others, counts[rest])
+    return None, (levels, counts)
 
 
 def _levels(values: Vector) -> tuple[Vector, Array]:

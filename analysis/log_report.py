@@ -22,7 +22,7 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import TURN, Log, is_clock
+from dopt.log import TURN, Log, count_text, is_clock
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, path, positive, tell
 from orchestrate.store import Store
@@ -373,7 +373,13 @@ def _limits(one: Signal) -> str:
 
 
 def _units(one: Signal, declared: bool) -> Iterator[str]:
-    """Yield what a state's values say of its unit."""
+    """Yield what a state's values say of its unit, and of what stands for a missing one."""
+    if one.alone is not None:
+        value, rows = one.alone
+        yield (
+            f"{one.name}: {value:g} in {count_text(rows, 'row')}, far from all others: not "
+            f"measured there? Leave such values empty"
+        )
     span = one.high - one.low
     whole = one.quantum == round(one.quantum, 6) and one.quantum >= 1
     if not math.isnan(one.period):

@@ -213,6 +213,18 @@ def test_likely_mistakes_of_units_are_said(seed: int) -> None:
     assert f"every {1e3 * DT:.1f} ms" in clean
 
 
+def test_a_number_that_stands_for_a_missing_one_is_said_and_left_out() -> None:
+    """Its jumps were taken for the ends of a turn, and the rest of the log for rest."""
+    u = held(np.random.default_rng(0), 2000)
+    angle = motor(u)
+    whole = report({"t": np.arange(2000) * DT, "th": angle, "u": u})
+    text = report({"t": np.arange(2000) * DT, "th": np.r_[angle[:-3], 3 * [-9999.0]], "u": u})
+    assert "th: -9999 in 3 rows, far from all others: not measured there?" in text
+    assert "wraps" not in text
+    assert "rest: nothing moves" not in text
+    assert "far from" not in whole
+
+
 def test_columns_that_are_named_like_inputs_are_and_flags_are_not_states() -> None:
     t = np.arange(50.0) * DT
     base = {"Time": t, "th": t, "ok": np.ones(50, dtype=bool)}
