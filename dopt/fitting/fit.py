@@ -6,7 +6,7 @@
 2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
 3. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
-   a network, with each window as one cluster: the residuals inside are one curve.
+   a network, by leaving out each window: the residuals inside are one curve.
 
 Blocks are logs, or equal parts of fewer than three logs. A held-out window is predicted from an
 initial state that is fitted to what comes before it, half a window long.
@@ -403,15 +403,26 @@ class _Selection:
         self.say(f"{what}: held-out loss {scores.mean():.4f}")
 
     def finish(self, model: Model, found: Solution, s: float) -> Estimate:
-        """Return the minimum with the covariance of its parameters."""
+        """Return the minimum with the covariance of its parameters.
+
+        Without a network each window's influence is the change that leaving it out makes, a
+        jackknife: at the minimum residuals are smaller than errors, by much with few windows. The
+        many parameters of a network have the influence at the minimum, which takes less memory.
+        """
         simulator = Simulator(model, self.data)
         found = solve(simulator, found.windows, found.p, s, scale=found.scale)
         weights = 1.0 / (1.0 + found.squares / found.scale)
-        linear = simulator.linear(found.p, found.windows, weights / s**2, scores=True)
+        owners = None if model.width else np.arange(len(weights))
+        linear = simulator.linear(
+            found.p, found.windows, weights / s**2, scores=True, owners=owners
+        )
         assert linear.scores is not None
         inverse = np.linalg.inv(linear.normal + np.eye(model.q))
-        middle = linear.scores.T @ linear.scores + np.eye(model.q)
-        covariance = inverse @ middle @ inverse
+        influence = linear.scores @ inverse
+        if not model.width:
+            others = linear.normal + np.eye(model.q) - linear.parts
+            influence = np.linalg.solve(others, linear.scores[:, :, None])[:, :, 0]
+        covariance = influence.T @ influence + inverse @ inverse
         return Estimate(model, found, s, 0.5 * (covariance + covariance.T))
 
     def check_steps(self, found: Estimate) -> None:
