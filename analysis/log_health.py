@@ -113,17 +113,25 @@ def effects(log: Log) -> list[Effect]:
     for j, name in enumerate(log.inputs):
         if all(np.ptp(piece.inputs[:, j]) == 0 for piece in pieces):
             continue
-        tried = [
-            one for p in WINDOWS if (one := _best_response(pieces, are_rates, j, p)) is not None
+        kinds = [are_rates] if any(are_rates) else [are_rates, [True] * len(are_rates)]
+        every = [
+            [one for p in WINDOWS if (one := _best_response(pieces, kind, j, p)) is not None]
+            for kind in kinds
         ]
+        tried = max(every, key=_most)
         if tried:
-            steady = [one for one in tried if one[0] >= STEADY]
-            most = max(steady or tried, key=lambda one: one[2].max() if steady else one[0])
+            most = max(tried, key=lambda one: _most([one]))
             steadiness, i, explained = most
             law = _law(pieces, j)
             delays = None if law[0] < FOLLOWS else _delays(tried)
             found.append(Effect(name, log.states[i], explained, steadiness, delays, *law))
     return found
+
+
+def _most(tried: Sequence[Response]) -> tuple[float, float]:
+    """Return the largest share that is explained steadily, and the largest steadiness."""
+    shares = [explained.max() for steadiness, _, explained in tried if steadiness >= STEADY]
+    return max(shares, default=0.0), max((one[0] for one in tried), default=0.0)
 
 
 def _delays(tried: Sequence[Response]) -> tuple[int, int] | None:
@@ -319,6 +327,9 @@ DIGITS = 1e-7
 FEW = 5
 """Levels below which a signal has no quantum: it is switched."""
 
+MANY = 20
+"""Levels beside which one that is far from all may stand for a missing measurement."""
+
 _BLOCKS = 100  # of a log, in which a signal may rest
 
 
@@ -343,6 +354,8 @@ class Signal:
         Period at which it wraps, NaN for none.
     rests : (100,) array
         Whether it rests in each hundredth of the log.
+    alone : (float, int), optional
+        A value far from all others, and its rows, which the other facts leave out.
     """
 
     name: str
@@ -355,6 +368,7 @@ class Signal:
     at_high: int
     period: float
     rests: Booleans
+    alone: tuple[float, int] | None
 
 
 @dataclass(frozen=True)
@@ -406,6 +420,10 @@ def _signal(name: str, parts: Sequence[Vector]) -> Signal:
     parts = [part[np.isfinite(part)] for part in parts]
     values = np.concatenate(parts)
     levels, counts = _levels(values)
+    alone, without = _alone(levels, counts)
+    if alone is not None:
+        parts = [part[~np.isclose(part, alone[0], rtol=DIGITS, atol=0)] for part in parts]
+        values, (levels, counts) = np.concatenate(parts), without
     step = quantum(levels)
     floor = 0.0 if math.isnan(step) else step / math.sqrt(12.0)
     noise = max(floor, _fast(parts))
@@ -414,9 +432,19 @@ def _signal(name: str, parts: Sequence[Vector]) -> Signal:
         int(count) if count >= crowd and len(levels) > FEW else 0 for count in counts[[0, -1]]
     )
     low, high = float(levels[0]), float(levels[-1])
-    rests = _rests(values, max(4.0 * noise, 0.01 * (high - low)))
+    rests = _rests(values, 4.0 * noise)
     period = _wrap_period(parts, high - low)
-    return Signal(name, low, high, len(levels), step, noise, at_low, at_high, period, rests)
+    facts = (len(levels), step, noise, at_low, at_high, period, rests, alone)
+    return Signal(name, low, high, *facts)
+
+
+def _alone(levels: Vector, counts: Array) -> tuple[tuple[float, int] | None, tuple[Vector, Array]]:
+    """Return a value beyond all others by more than their range, its rows, and the other levels."""
+    for at, rest in ((0, slice(1, None)), (-1, slice(-1))):
+        others = levels[rest]
+        if len(others) > MANY and np.abs(others - levels[at]).min() > np.ptp(others):
+            return (float(levels[at]), int(counts[at])), (others, counts[rest])
+    return None, (levels, counts)
 
 
 def _levels(values: Vector) -> tuple[Vector, Array]:
@@ -459,9 +487,12 @@ def _fast(parts: Sequence[Vector]) -> float:
     return min(found, default=0.0)
 
 
-def _rests(values: Vector, tolerance: float) -> Booleans:
-    blocks = np.array_split(values, _BLOCKS)
-    return np.array([block.size > 1 and np.ptp(block) <= tolerance for block in blocks])
+def _rests(values: Vector, noise: float) -> Booleans:
+    """Return where a signal moves by no more than noise, 1 % of its range and 5 % of its most."""
+    blocks = [block for block in np.array_split(values, _BLOCKS) if block.size > 1]
+    moved = np.array([np.ptp(block) for block in blocks])
+    resting = moved <= max(noise, min(0.01 * np.ptp(values), 0.05 * moved.max(initial=0.0)))
+    return np.concatenate([resting, np.zeros(_BLOCKS - len(blocks), bool)])
 
 
 def _wrap_period(parts: Sequence[Vector], span: float) -> float:

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,13 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import CLOCKS, TURN, Log
+from dopt.log import TURN, Log, count_text, is_clock
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, path, positive, tell
 from orchestrate.store import Store
 
 INPUTS = re.compile(
-    r"^u\d*$|input|volt|torque|^tau|current|pwm|force|throttle|command|(^|_)cmd($|_|\d)",
+    r"(^|\.)u\d*$|input|volt|torque|^tau|current|pwm|force|throttle|command|(^|_)cmd($|_|\d)",
     re.IGNORECASE,
 )
 """Columns that are taken for inputs where none are named."""
@@ -40,7 +40,8 @@ _MEASURED = re.compile(r"meas", re.IGNORECASE)
 def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return the table in a file, by the ending of its name.
 
-    ``.csv`` and ``.csv.gz`` have a line of names; ``.parquet``; ``.mat`` of MATLAB, 7.3 included;
+    ``.csv`` and ``.csv.gz`` have a line of names, and commas, tabs, or semicolons with decimal
+    commas or points; ``.parquet``; ``.mat`` of MATLAB, 7.3 included;
     ``.h5`` or ``.hdf5``. In the last two, variables of one length are columns, and those in a
     structure or a group are ``group.name``.
 
@@ -62,8 +63,8 @@ def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
         table = _READERS[ending](file)
     except (ValueError, EOFError, OSError) as error:  # of each of the libraries
         raise AnalysisError(
-            f"{file} cannot be read ({error}), but a table by its ending {ending} is expected: "
-            f"export it again."
+            f"{file} cannot be read ({str(error).strip()}), but a table by its ending {ending} is "
+            f"expected: export it again{', in UTF-8 with one line of names' * ('csv' in ending)}."
         ) from error
     if table.empty:
         raise AnalysisError(f"{file} has no rows, but a recorded run is expected: give another.")
@@ -100,7 +101,9 @@ def log_of(
 ) -> Log:
     """Return a log of a table, with the columns that are named like inputs for those."""
     table = table.rename(columns=str)
-    inputs = _guessed_inputs(table) if inputs is None else inputs
+    if inputs is None:
+        named = states.values() if isinstance(states, Mapping) else states or ()
+        inputs = [one for one in _guessed_inputs(table) if one not in named]
     if not inputs:
         raise AnalysisError(
             f"none of the columns {', '.join(map(str, table))} is named like an input (u, voltage, "
@@ -112,7 +115,7 @@ def log_of(
         states = [
             one
             for one in map(str, table)
-            if one not in taken and one.lower() not in CLOCKS
+            if one not in taken and not is_clock(one) and not one.startswith("Unnamed: ")
             if not is_flag(table[one]) and not INPUTS.search(one)
         ]
     return Log(table, states=states, inputs=inputs, **options)
@@ -132,10 +135,17 @@ def _guessed_inputs(table: pd.DataFrame) -> list[str]:
 
 
 def _csv(file: Path) -> pd.DataFrame:
-    table = pd.read_csv(file, skipinitialspace=True)
-    if table.shape[1] == 1 and ";" in str(table.columns[0]):
-        raise ValueError("its columns are separated by ';', not by ','")
-    return table
+    names = [str(one) for one in pd.read_csv(file, nrows=0)]
+    if all(re.fullmatch(r"[-+.,;\t\de]+", one) for one in names):
+        raise ValueError("its first line has numbers and no names of columns")
+    mark = next((one for one in ";\t" if len(names) == 1 and one in names[0]), ",")
+    decimal = "," if mark == ";" else "."
+    table = pd.read_csv(file, sep=mark, decimal=decimal, skipinitialspace=True)
+    if not isinstance(table.index, pd.RangeIndex):  # the first values of longer rows
+        if table.iloc[:, -1].notna().any():
+            raise ValueError("its rows have more values than its first line has names")
+        table = table.reset_index().iloc[:, : len(table.columns)].set_axis(table.columns, axis=1)
+    return table.rename(columns=str.strip)
 
 
 def _mat(file: Path) -> pd.DataFrame:
@@ -194,6 +204,13 @@ def _of_variables(file: Path, variables: Mapping[str, Any]) -> pd.DataFrame:
 
 def _flattened(found: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in found.items():
+        if isinstance(value, list) and all(isinstance(one, Mapping) for one in value):
+            value = {
+                one.get("label") or str(i): one.get("values", one)  # of Simulink
+                for i, one in enumerate(value, 1)
+            }
+        elif isinstance(value, np.ndarray) and value.dtype.names:
+            value = {one: value[one] for one in value.dtype.names}
         if isinstance(value, Mapping):
             yield from _flattened(value, f"{before}{name}.")
         else:
@@ -249,19 +266,23 @@ def run(options: argparse.Namespace) -> int:
             f"is expected: give one."
         )
     table = read_table(options.file).rename(columns=str)
+    states = names_of("--states", options.states)
+    angles = tuple(names_of("--angles", options.angles) or ())
+    units = names_of("--units", options.units) or {}
     log = log_of(
         table,
-        names_of("--states", options.states),
+        states,
         names_of("--inputs", options.inputs),
         time=options.time,
         dt=options.dt,
         gap=options.gap,
-        angles=tuple(names_of("--angles", options.angles) or ()),
-        units=names_of("--units", options.units),
+        angles=angles,
+        units=units,
     )
+    declared = {*angles, *units} | {name for name, one in (states or {}).items() if one in units}
     health, file = examine(log), Path(options.file)
     guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
-    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table)):
+    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, declared)):
         tell(sys.stdout, f"{line}\n")
     from analysis.figures.reports import draw_log  # Matplotlib: other commands do without it
 
@@ -286,12 +307,17 @@ def names_of(option: str, text: str | None) -> dict[str, str] | None:
     return found
 
 
-def lines(log: Log, health: Health, table: pd.DataFrame) -> Iterator[str]:
-    """Yield the sentences of the report: sampling, signals, inputs, suspicions, notes."""
+def lines(
+    log: Log, health: Health, table: pd.DataFrame, declared: Collection[str] = ()
+) -> Iterator[str]:
+    """Yield the sentences of the report: sampling, signals, inputs, suspicions, notes.
+
+    The units of ``declared`` states are not doubted.
+    """
     yield f"sampling: {_sampling(log, health)}"
     for one in health.states:
         yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
-        yield from _units(one)
+        yield from _units(one, one.name in declared)
     for one in health.inputs:
         yield f"{one.name}: {_signal(one)}{_limits(one)}"
     wrapped = [one.name for one in health.states if not math.isnan(one.period)]
@@ -321,9 +347,8 @@ def _sampling(log: Log, health: Health) -> str:
     text += f", {len(log.pieces)} piece{'s' * (len(log.pieces) > 1)} without gaps"
     if health.step >= 1:
         likely = "ms" if health.step < 1e3 else "us" if health.step < 1e6 else "ns"
-        text += (
-            f"; stamps in {likely}? A step of {number(health.step)} s is long: --units t={likely}"
-        )
+        text += f"; stamps in {likely}? A step of {number(health.step)} s is long: "
+        text += f"--units time={likely}"
     return text
 
 
@@ -347,14 +372,22 @@ def _limits(one: Signal) -> str:
     return f", saturated: {' and '.join(rows)}" if rows else ", not saturated"
 
 
-def _units(one: Signal) -> Iterator[str]:
-    """Yield what a state's values say of its unit."""
+def _units(one: Signal, declared: bool) -> Iterator[str]:
+    """Yield what a state's values say of its unit, and of what stands for a missing one."""
+    if one.alone is not None:
+        value, rows = one.alone
+        yield (
+            f"{one.name}: {value:g} in {count_text(rows, 'row')}, far from all others: not "
+            f"measured there? Leave such values empty"
+        )
     span = one.high - one.low
     whole = one.quantum == round(one.quantum, 6) and one.quantum >= 1
     if not math.isnan(one.period):
         unit = {1.0: "rev", TURN: "rad", 360.0: "deg"}.get(one.period, f"counts/{one.period:.0f}")
         words = {"rad": "name it in --angles"}.get(unit, f"--angles and --units {one.name}={unit}")
         yield f"{one.name}: wraps about every {one.period:.6g}: an angle in {unit}? {words}"
+    elif declared:
+        return
     elif whole and span > 50:
         yield (
             f"{one.name}: whole numbers over {span:.6g}: degrees, or counts of an encoder? "

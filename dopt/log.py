@@ -6,9 +6,11 @@ notes of a :class:`Log`. Rows are counted from 0.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
     from dopt.systems.plant import Plant
 
 CLOCKS = ("time", "t", "timestamp")
-"""Names of columns that are taken for the time, in lower case."""
+"""Names of columns that are taken for the time, in lower case, also in a group: ``run.t``."""
 
 GAP = 10.0
 """Median steps after which a step is a gap, unless ``gap`` is given."""
@@ -45,6 +47,16 @@ _ROLL_OVERS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
 """Times after which a 32-bit counter of µs or ms begins again [s]."""
 
 _COUNTER_BITS = (16, 32)
+
+_MISSING = ("", "na", "nan", "nat", "<na>", "n/a", "none", "null")
+
+_DATE = re.compile(
+    r"(\d{4}-[01]\d-[0-3]\d(?:[ T][0-2]\d:[0-5]\d(?::[0-5]\d(?:[.,]\d+)?)?)?) ?(Z|[-+]\d\d:?\d*)?"
+)
+
+
+def is_clock(name: str) -> bool:
+    return name.strip().lower().rsplit(".", 1)[-1] in CLOCKS
 
 
 def columns_of(data: Any, names: Sequence[str] | None = None) -> dict[str, npt.NDArray[Any]]:
@@ -70,7 +82,8 @@ def columns_of(data: Any, names: Sequence[str] | None = None) -> dict[str, npt.N
     else:
         raise SpecificationError(
             f"the data of a log is of the type {type(data).__name__}, but a DataFrame, a mapping "
-            f"of names to columns, or an array with 'columns' is expected: give one."
+            f"of names to columns, or an array with 'columns' is expected: give one, of a file by "
+            f"analysis.log_report.read_table."
         )
     shapes = {name: values.shape for name, values in table.items()}
     if len(set(shapes.values())) != 1 or any(len(s) != 1 or s == (0,) for s in shapes.values()):
@@ -92,7 +105,7 @@ def clock_column(
     table: Mapping[str, Any], time: Any, dt: float | None, notes: list[str]
 ) -> str | None:
     """Return the name of the column of the stamps, None where they are given or made of dt."""
-    found = [name for name in table if name.strip().lower() in CLOCKS]
+    found = [name for name in table if is_clock(name)]
     if time is not None and dt is not None:
         raise SpecificationError(
             f"a log has the time {time if isinstance(time, str) else 'of an array'!r} and dt = "
@@ -125,6 +138,8 @@ def _factor(name: str, unit: str | float, known: Mapping[str, float]) -> float:
     if isinstance(unit, int | float | np.number) and math.isfinite(unit) and unit != 0:
         return float(unit)
     text = str(unit).strip()
+    if re.fullmatch(r"-?\d*\.?\d+(e-?\d+)?", text) and float(text):  # of a command line
+        return float(text)
     text = text if text in known else text.removesuffix("/s")
     counts = re.fullmatch(r"counts?/(\d+(?:\.\d+)?)", text) if "rad" in known else None
     if counts and float(counts[1]) > 0:
@@ -157,16 +172,21 @@ def _numbers(name: str, values: npt.NDArray[Any]) -> Array:
 
 def _number(name: str, row: int, value: Any) -> float:
     text = str(value).strip()
-    if text.lower() in ("", "na", "<na>", "n/a", "none", "null"):
+    if text.lower() in _MISSING:
         return math.nan
     try:
         return float(text)
     except ValueError:
         comma = re.fullmatch(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", text)
-        hint = "write a decimal point (in pandas: read_csv(..., decimal=','))" if comma else ""
+        hint = "correct it, or leave it empty where nothing was measured"
+        if comma:
+            hint = "write a decimal point (in pandas: read_csv(..., decimal=','))"
+        elif re.search(r"\d[/.:]\d+[/.:]\d", text):
+            hint = "write dates as 2026-11-29 12:30:00.5 (in pandas: to_datetime)"
+        elif row == 0 and not re.search(r"\d", text):
+            hint = "remove the row, if it holds units, and give them as units"
         raise SpecificationError(
-            f"column {name!r} of a log is {text!r} in row {row}, but a number is expected: "
-            f"{hint or 'correct it, or leave it empty where nothing was measured'}."
+            f"column {name!r} of a log is {text!r} in row {row}, but a number is expected: {hint}."
         ) from None
 
 
@@ -239,13 +259,22 @@ def stamps_of(
 
 
 def _dates(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return texts that are dates as datetime64, anything else as it is."""
-    if values.dtype.kind in "OUST" and values.size and re.match(r"\d{4}-\d\d-\d\d", str(values[0])):
-        try:
-            return np.array([str(one).removesuffix("Z") for one in values], "datetime64[ns]")
-        except ValueError:
-            return values
+    """Return texts that are dates as datetime64 in UTC, anything else as it is."""
+    if values.dtype.kind in "OUST":
+        texts = [str(one).strip() for one in values]
+        found = [_DATE.fullmatch(one) for one in texts]
+        others = {text for text, one in zip(texts, found, strict=True) if not one}
+        if any(found) and all(text.lower() in _MISSING for text in others):
+            with contextlib.suppress(ValueError):  # of the 31st of February
+                dates = [_utc(one[1], one[2]) if one else "NaT" for one in found]
+                return np.array(dates, "datetime64[ns]")
+        return values
     return values.astype("datetime64[ns]") if values.dtype.kind == "M" else values
+
+
+def _utc(date: str, offset: str | None) -> np.datetime64:
+    ahead = datetime.fromisoformat(f"2000-01-01T00:00{offset or 'Z'}").utcoffset()
+    return np.datetime64(date.replace(",", "."), "ns") - np.timedelta64(ahead)
 
 
 def _check_resolution(name: str, values: npt.NDArray[Any]) -> None:
@@ -457,7 +486,7 @@ class Log:
                 f"plant ({', '.join(plant.states)}): give columns={{state: column}}."
             )
         notes = []
-        if time is None and dt is None and not any(name.lower() in CLOCKS for name in table):
+        if time is None and dt is None and not any(map(is_clock, table)):
             dt = float(plant.dt)
             notes.append(f"No column of stamps: rows are the plant's dt of {dt:g} s apart.")
         log = cls(
@@ -577,10 +606,11 @@ def _without_gaps(
     pieces = np.split(rows, np.flatnonzero(begins)[1:])
     alone = [piece for piece in pieces if len(piece) == 1]
     if len(alone) == len(pieces) or not rows.size:
+        held = "fill the inputs where they were held (in pandas: ffill()), or give a longer gap."
         raise SpecificationError(
             f"no two of the {t.size} rows of a log follow each other with a time, inputs and no "
-            f"gap, but a piece of two rows is expected: fill the inputs where they were held (in "
-            f"pandas: ffill()), or give a longer gap."
+            f"gap, but a piece of two rows is expected: "
+            + ("sort the rows by time." if 2 * int(back.sum()) > rows.size else held)
         )
     if alone:
         notes.append(f"Alone between two gaps, left out: {rows_text(np.concatenate(alone))}.")
@@ -602,7 +632,7 @@ def _unwrapped(
     """Return an angle that is followed over the ends of a turn within each piece."""
     used = angle[np.concatenate(pieces)]
     used = used[np.isfinite(used)]
-    span = float(np.ptp(used)) if used.size else 0.0
+    span = float(np.ptp(np.quantile(used, (0.001, 0.999)))) if used.size else 0.0  # but glitches
     if span > _ONE_TURN:
         notes.append(f"Angle {name!r} counts turns ({span / TURN:.3g} of them): it is kept.")
         return angle

@@ -41,13 +41,19 @@ from dopt.fitting.fit import (
     layout_of,
     logs_of,
     measuring,
-    rescaled,
     rows_of_logs,
     time_scale,
 )
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Model, data_of, measured_names
-from dopt.fitting.problem import Simulator, Windows, first_states, solve, windows_of
+from dopt.fitting.problem import (
+    Simulator,
+    Windows,
+    first_states,
+    left_over,
+    solve,
+    windows_of,
+)
 from dopt.fitting.simulation import Data
 from dopt.log import Log, Piece
 from dopt.systems.plant import Plant, Unknown, first_guess
@@ -395,7 +401,7 @@ class _Search:
         if not len(windows.rows):
             return
         found = solve(Simulator(self.physics, self.data), windows, self.constants, 1.0)
-        left = rescaled(self.plant, self.data, self.physics, found).deviations
+        left = left_over(self.data, self.physics, found)
         self.data = self.data._replace(deviations=np.maximum(left, self.noise))
         found = solve(Simulator(self.physics, self.data), found.windows, found.p, 1.0)
         self.constants = self.p = found.p

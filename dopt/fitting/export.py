@@ -73,13 +73,15 @@ def to_torch(found: Any) -> Any:
         def __init__(self) -> None:
             super().__init__()
             self.constants = torch.nn.Parameter(torch.tensor(values.constants))
-            first = torch.nn.Linear(n, w, dtype=torch.float64)
-            last = torch.nn.Linear(w, r, dtype=torch.float64)
-            with torch.no_grad():
-                tensors = (first.weight, first.bias, last.weight, last.bias)
-                for tensor, part in zip(tensors, model.matrices(values.weights), strict=True):
-                    tensor.copy_(torch.tensor(part))
-            self.network = torch.nn.Sequential(first, torch.nn.Tanh(), last) if w else None
+            self.network = None
+            if w:
+                first = torch.nn.Linear(n, w, dtype=torch.float64)
+                last = torch.nn.Linear(w, r, dtype=torch.float64)
+                self.network = torch.nn.Sequential(first, torch.nn.Tanh(), last)
+                with torch.no_grad():
+                    tensors = self.network.parameters()
+                    for tensor, part in zip(tensors, model.matrices(values.weights), strict=True):
+                        tensor.copy_(torch.tensor(part))
             self.register_buffer("sizes", torch.tensor(values.sizes))
             self.register_buffer("centers", torch.tensor(s.feature_centers))
             self.register_buffer("scales", torch.tensor(s.feature_scales))
@@ -274,7 +276,8 @@ def _simulated(found: Any) -> tuple[Integers, Array, Array]:
         part = states[first : last + 1]
         new = np.isnan(part).all(axis=1)
         part[new] = simulator.states(solution.p, first, last, start)[new]
-    errors = (data.measured - states[:, model.structure.measured]) / data.deviations
+    errors = data.measured - states[:, model.structure.measured]
+    errors /= np.array([*found.noise.values()])
     rows = np.flatnonzero(np.isfinite(errors).any(axis=1) & np.isfinite(states).all(axis=1))
     return rows, states[rows], np.sqrt(np.nanmean(np.square(errors[rows]), axis=1))
 

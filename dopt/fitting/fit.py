@@ -6,7 +6,7 @@
 2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
 3. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
-   a network, with each window as one cluster: the residuals inside are one curve.
+   a network, by leaving out each window: the residuals inside are one curve.
 
 Blocks are logs, or equal parts of fewer than three logs. A held-out window is predicted from an
 initial state that is fitted to what comes before it, half a window long.
@@ -14,6 +14,7 @@ initial state that is fitted to what comes before it, half a window long.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
 import math
@@ -27,7 +28,7 @@ import numpy as np
 from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
-from dopt.fitting.model import Layout, Model, data_of, measured_names
+from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import (
     HORIZONS,
     Predicted,
@@ -35,6 +36,7 @@ from dopt.fitting.problem import (
     Solution,
     Windows,
     first_states,
+    left_over,
     linear_predictions,
     predicted,
     prediction_rows,
@@ -43,7 +45,7 @@ from dopt.fitting.problem import (
 )
 from dopt.fitting.simulation import Data
 from dopt.log import Log
-from dopt.systems.plant import Encoder, Plant, Unknown, first_guess
+from dopt.systems.plant import Plant, Unknown, first_guess
 from dopt.types import Array, Integers
 
 BLOCKS = 5
@@ -75,6 +77,9 @@ MOST_SCANNED = 150
 
 ROWS_SCANNED = 8000
 """Rows of these windows."""
+
+STEP_ERROR = 0.3
+"""Largest error of the integration that goes unsaid, in standard deviations of what is left."""
 
 
 def fit(
@@ -142,6 +147,7 @@ def fit(
     chosen = physics
     if width and (found := work.choose_network(width, weights, seed)) is not None:
         chosen = work.finish(*found)
+    work.check_steps(chosen)
     held_out = work.held_out()
     return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
 
@@ -201,8 +207,9 @@ class _Selection:
         fitting = [length for length in tried if 4.0 * length <= longest]
         if not fitting and longest <= 2.0 * least:
             raise SpecificationError(
-                f"the longest piece of the logs has {longest:g} s, but at least {2 * least:g} s, "
-                f"{2 * FEWEST_ROWS} samples, are expected: give a longer run."
+                f"the longest piece of a block, of {len(self.blocks)} that judge the fit, has "
+                f"{longest:g} s, but at least {2 * least:g} s, {2 * FEWEST_ROWS} samples, are "
+                f"expected: give longer runs."
             )
         return fitting or [least]
 
@@ -269,7 +276,7 @@ class _Selection:
                     f"{self.delay + best * self.step:g} s, or a dopt.unknown one"
                 )
         self.model = self._model(self.delay, free=True)
-        self.data = rescaled(self.plant, self.data, found[1], found[2])
+        self.data = self.data._replace(deviations=left_over(self.data, *found[1:]))
         p = self.model.extended(found[2].p, found[1])
         self.solution = found[2]._replace(p=p)
 
@@ -396,37 +403,51 @@ class _Selection:
         self.say(f"{what}: held-out loss {scores.mean():.4f}")
 
     def finish(self, model: Model, found: Solution, s: float) -> Estimate:
-        """Return the minimum with the covariance of its parameters."""
+        """Return the minimum with the covariance of its parameters.
+
+        Without a network each window's influence is the change that leaving it out makes, a
+        jackknife: at the minimum residuals are smaller than errors, by much with few windows. The
+        many parameters of a network have the influence at the minimum, which takes less memory.
+        """
         simulator = Simulator(model, self.data)
         found = solve(simulator, found.windows, found.p, s, scale=found.scale)
         weights = 1.0 / (1.0 + found.squares / found.scale)
-        linear = simulator.linear(found.p, found.windows, weights / s**2, scores=True)
+        owners = None if model.width else np.arange(len(weights))
+        linear = simulator.linear(
+            found.p, found.windows, weights / s**2, scores=True, owners=owners
+        )
         assert linear.scores is not None
         inverse = np.linalg.inv(linear.normal + np.eye(model.q))
-        middle = linear.scores.T @ linear.scores + np.eye(model.q)
-        covariance = inverse @ middle @ inverse
+        influence = linear.scores @ inverse
+        if not model.width:
+            others = linear.normal + np.eye(model.q) - linear.parts
+            influence = np.linalg.solve(others, linear.scores[:, :, None])[:, :, 0]
+        covariance = influence.T @ influence + inverse @ inverse
         return Estimate(model, found, s, 0.5 * (covariance + covariance.T))
+
+    def check_steps(self, found: Estimate) -> None:
+        """Note it where simulations in steps of half the length differ."""
+        halved, solution = copy.copy(found.model), found.solution
+        longest = 0.5 * found.model.structure.longest_step
+        halved.structure = found.model.structure._replace(longest_step=longest)
+        residuals = [
+            Simulator(model, self.data).residuals(solution.p, solution.windows)
+            for model in (found.model, halved)
+        ]
+        moved = np.subtract(*residuals) * self.data.deviations
+        moved /= left_over(self.data, found.model, solution)
+        most = float(np.sqrt(np.nanmean(np.square(moved), axis=0)).max())
+        if most > STEP_ERROR:
+            self.notes.append(
+                f"steps of {2 * longest:g} s are too long for these equations: in half of them the "
+                f"simulations differ by {most:.2g} standard deviations of what is left; declare a "
+                f"smaller dt, or softer corners, such as tanh(rate / 0.5) for tanh(rate / 0.05)"
+            )
 
 
 def latest_effect(plant: Plant, delay: float, step: float) -> float:
     """Return the longest time from an input to its effect that is tried [s]."""
     return max(delay, 0.0) + max(SCANNED) * step + 3.0 * first_guess(plant.lag)
-
-
-def rescaled(plant: Plant, data: Data, model: Model, found: Solution) -> Data:
-    """Return data with the standard deviation of each measured state from what a fit has left."""
-    residuals = Simulator(model, data).residuals(found.p, found.windows)
-    floors = [
-        noise.noise if isinstance(noise, Encoder) else 1e-9 * max(float(np.nanstd(column)), 1e-300)
-        for noise, column in zip(
-            (plant.measured.get(n, 0.0) for n in measured_names(plant)),
-            data.measured.T,
-            strict=True,
-        )
-    ]
-    typical = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
-    deviations = data.deviations * np.maximum(typical, np.array(floors) / data.deviations)
-    return data._replace(deviations=deviations)
 
 
 def layout_of(model: Model, data: Data, p: Array, windows: Windows) -> Layout:

@@ -22,6 +22,7 @@ from dopt.fitting.problem import (
     errors_ahead,
     first_states,
     horizon_errors,
+    left_over,
     linear_predictions,
     predicted,
     prediction_rows,
@@ -33,6 +34,9 @@ from dopt.types import Array, Integers
 
 USEFUL = 0.5
 """Largest error of a model that is worth using, by the changes themselves."""
+
+CORRELATED = 0.7
+"""Correlation of residuals with the row before from which the equations lack something."""
 
 TOLD_APART = 0.1
 """Largest standard error of delay and lag that are told apart, by their sizes together."""
@@ -89,7 +93,7 @@ class Fitted:
     chosen, physics : Estimate
         What was chosen, and the fit of the constants without a network; the same if it was refused.
     data : Data
-        Rows of all logs, and the standard deviations of what the constants leave.
+        Rows of all logs, and the standard deviations by which they were weighed.
     """
 
     def __init__(
@@ -105,6 +109,7 @@ class Fitted:
     ) -> None:
         self.plant, self.hold, self.selection, self.tests = plant, hold, selection, list(tests)
         self.data, self.chosen, self.physics = data, chosen, physics
+        self._deviations = left_over(data, chosen.model, chosen.solution)
         self._held_out = dict(held_out)
         self.has_network = chosen is not physics
         if {"delay", "lag"} <= {*physics.model.names[physics.model.n_named :]}:
@@ -162,7 +167,7 @@ class Fitted:
     def noise(self) -> dict[str, float]:
         """Standard deviation of what the model leaves of each measured state, in its unit."""
         names = measured_names(self.plant)
-        return dict(zip(names, map(float, self.data.deviations), strict=True))
+        return dict(zip(names, map(float, self._deviations), strict=True))
 
     def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike) -> Array:
         """Return dx/dt, (N, d), at states, (N, d), under inputs that act there, (N, m)."""
@@ -234,8 +239,7 @@ class Fitted:
 
         Before the first horizon they are the noise, and beyond the last one they stay.
         """
-        found, noise = self._held_out["model"], self.data.deviations
-        return errors_ahead(found, self.horizons, seconds, noise)
+        return errors_ahead(self._held_out["model"], self.horizons, seconds, self._deviations)
 
     @property
     def horizons(self) -> list[float]:
@@ -258,12 +262,12 @@ class Fitted:
 
     @functools.cached_property
     def _tested(self) -> dict[str, list[Predicted]]:
-        data = data_of(self.plant, self.tests, self.hold, self.data.deviations)
-        history = 0.5 * self.selection.window
+        data = data_of(self.plant, self.tests, self.hold, self._deviations)
+        history, skip, ahead = 0.5 * self.selection.window, self._latest(), 2.0 * self.plant.dt
+        longest = float((data.time[data.lasts] - data.time[data.firsts]).max())
+        horizon = min(max(self.horizons), longest - history - skip - ahead - 2.0 * self.plant.dt)
         rows = prediction_rows(
-            *(data, (0, len(data.time) - 1), history, max(self.horizons)),
-            skip=self._latest(),
-            ahead=2.0 * self.plant.dt,
+            data, (0, len(data.time) - 1), history, horizon, skip=skip, ahead=ahead
         )
         models = {"model": self.chosen, "physics alone": self.physics}
         found = {
@@ -277,16 +281,18 @@ class Fitted:
     def coverage(self, level: float = 0.9) -> dict[str, float]:
         """Return the share of held-out measurements within the bounds of predictions at a level.
 
-        The bounds come from the errors of the other blocks.
+        The bounds come from the errors of the other blocks; NaN with a single one.
         """
         from scipy.stats import norm
 
         z, parts = float(norm.ppf(0.5 + 0.5 * level)), self._held_out["model"]
-        held = np.zeros((2, len(self.data.deviations)))  # inside, and all
+        held = np.zeros((2, len(self._deviations)))  # inside, and all
         for i, part in enumerate(parts):
             others = [each for j, each in enumerate(parts) if j != i]
             for seconds, error, change in zip(part.seconds, part.errors, part.changes, strict=True):
-                bound = z * errors_ahead(others, self.horizons, seconds, self.data.deviations)
+                if not others:
+                    break
+                bound = z * errors_ahead(others, self.horizons, seconds, self._deviations)
                 seen = np.isfinite(change)
                 held += (seen & (np.abs(error) <= bound)).sum(axis=0), seen.sum(axis=0)
         with np.errstate(invalid="ignore"):
@@ -324,6 +330,8 @@ class Fitted:
     def verdict(self) -> str:
         """Return in a sentence how far ahead the model is worth using."""
         useful, longest = self._useful()
+        if not longest:
+            return "Not judged: no run is long enough to be predicted."
         if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
         if useful < longest:
@@ -373,12 +381,16 @@ class Fitted:
                 )
         lines.append("")
         for name, share in self.coverage().items():
-            lines.append(f"Bounds of 90 % hold {100 * share:.0f} % of held-out {name}.")
-        for name, (own, other) in self.whiteness().items():
+            told = "are not judged on" if math.isnan(share) else f"hold {100 * share:.0f} % of"
+            lines.append(f"Bounds of 90 % {told} held-out {name}.")
+        white = self.whiteness()
+        for name, (own, other) in white.items():
             lines.append(
                 f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with "
                 f"an earlier input (0: white)."
             )
+        if self.has_network or any(abs(own) > CORRELATED for own, _ in white.values()):
+            lines.append("The equations lack something, which no standard error above contains.")
         return "\n".join([*lines, self.verdict()])
 
     def store(self, url: str | None = None) -> str:
@@ -438,7 +450,7 @@ class Fitted:
 
     def _with(self, run: Any) -> Data:
         log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
-        return data_of(self.plant, [log], self.hold, self.data.deviations)
+        return data_of(self.plant, [log], self.hold, self._deviations)
 
     def _whole(self, data: Data, history: float) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""

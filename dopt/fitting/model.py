@@ -168,6 +168,9 @@ HOLDS = ("zero", "linear")
 FINEST = 0.004
 """Longest part of a sample over which a linearly interpolated input is taken as constant [s]."""
 
+MOST_STEPS = 300.0
+"""Steps of a plant in one of a log, or of a log in one of a plant, beyond which a unit is wrong."""
+
 
 class Known(NamedTuple):
     """The known part of a plant, compiled."""
@@ -426,7 +429,7 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
     Raises
     ------
     SpecificationError
-        If a log has other states or inputs than the plant.
+        If a log has other states or inputs than the plant, or steps of another unit.
     """
     if hold not in HOLDS:
         raise SpecificationError(
@@ -447,6 +450,14 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
             )
         columns = [log.states.index(name) for name in wanted]
         given = [log.inputs.index(name) for name in plant.inputs]
+        steps = np.concatenate([np.diff(piece.time) for piece in log.pieces])
+        step = float(np.median(steps)) if len(steps) else plant.dt
+        if not 1.0 / MOST_STEPS <= step / plant.dt <= MOST_STEPS:
+            raise SpecificationError(
+                f"a log has steps of {step:g} s, but steps of about the plant's dt of "
+                f"{plant.dt:g} s are expected: give the unit of its stamps, such as "
+                f"units={{'time': 'ms'}}, or correct dt."
+            )
         for piece in log.pieces:
             one = Piece(piece.time, piece.measured[:, columns], piece.inputs[:, given])
             pieces.append(_interpolated(one) if hold == "linear" else one)

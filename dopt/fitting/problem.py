@@ -27,11 +27,12 @@ from numba import types
 from scipy.linalg import blas, cho_factor, cho_solve
 
 from dopt.fitting import simulation
-from dopt.fitting.model import Model
+from dopt.fitting.model import Model, measured_names
 from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
+from dopt.systems.plant import Encoder
 from dopt.types import Array, Booleans, Integers
 
 BATCH_ROWS = 1200
@@ -371,6 +372,19 @@ def _kind(value: Any) -> Any:
     return types.float64 if isinstance(value, float) else numba.typeof(value)
 
 
+def left_over(data: Data, model: Model, found: Solution) -> Array:
+    """Return the standard deviation of each measured state from what a fit has left, (n,)."""
+    residuals = Simulator(model, data).residuals(found.p, found.windows)
+    typical = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
+    floors = []
+    for name, column in zip(measured_names(model.plant), data.measured.T, strict=True):
+        noise = model.plant.measured.get(name)
+        rounded = 1e-9 * max(float(np.nanstd(column)), 1e-300)
+        floors.append(noise.noise if isinstance(noise, Encoder) else rounded)
+    left: Array = data.deviations * np.maximum(typical, np.array(floors) / data.deviations)
+    return left
+
+
 def windows_of(
     data: Data, first: int, last: int, seconds: float, *, skip: float, ahead: float
 ) -> Integers:
@@ -464,17 +478,21 @@ class Predicted(NamedTuple):
         )
 
     def at(self, horizon: float) -> tuple[Array, Array]:
-        """Return errors and changes, (windows, n), at the last measurement up to a time."""
-        errors, changes = [], []
-        for seconds, error, change in zip(self.seconds, self.errors, self.changes, strict=True):
-            inside = np.flatnonzero(
-                (seconds <= horizon * (1 + 1e-9)) & np.isfinite(change).all(axis=1)
-            )
-            if len(inside) and seconds[inside[-1]] >= 0.8 * horizon:
-                errors.append(error[inside[-1]])
-                changes.append(change[inside[-1]])
+        """Return errors and changes, (windows, n), at the last measurement up to a time.
+
+        It is NaN of a state that was not measured in the last fifth of the time.
+        """
         n = len(self.deviations)
-        return np.array(errors).reshape(-1, n), np.array(changes).reshape(-1, n)
+        found = np.full((2, len(self.seconds), n), np.nan)
+        for k, (seconds, *both) in enumerate(
+            zip(self.seconds, self.errors, self.changes, strict=True)
+        ):
+            late = (seconds <= horizon * (1 + 1e-9)) & (seconds >= 0.8 * horizon)
+            for c in range(n):
+                for row in np.flatnonzero(late & np.isfinite(both[1][:, c]))[-1:]:
+                    found[:, k, c] = [part[row, c] for part in both]
+        errors, changes = found[:, np.isfinite(found[1]).any(axis=1)]
+        return errors, changes
 
 
 def predicted(simulator: Simulator, p: Array, rows: Integers) -> Predicted:
@@ -540,10 +558,12 @@ def horizon_errors(
         both = [each.at(horizon) for each in found]
         errors = np.concatenate([error for error, _ in both])
         changes = np.concatenate([change for _, change in both])
-        if not len(errors):
+        seen = np.isfinite(changes)
+        if not (len(seen) and seen.any(axis=0).all()):
             continue
         row = []
-        for error, change in zip(errors.T, changes.T, strict=True):
+        for c, here in enumerate(seen.T):
+            error, change = errors[here, c], changes[here, c]
             rms = float(np.sqrt(np.mean(np.square(error))))
             moved = float(np.sqrt(np.mean(np.square(change))))
             row.append(

@@ -75,6 +75,25 @@ def test_a_delay_is_found_in_open_loop(seed: int, delay: int) -> None:
     assert effect.delays == (delay, delay)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("delay", [0, 1, 6])
+def test_a_delay_is_found_where_the_input_drives_the_state_itself(seed: int, delay: int) -> None:
+    """As of a temperature or a level, of which no rate is measured."""
+    rng = np.random.default_rng(seed)
+    u, level, found = np.repeat(rng.uniform(0, 5, 100), 20), 20.0, []
+    for k in range(len(u)):
+        found.append(level)
+        level += DT * (20.0 - level + 10 * u[max(k - delay, 0)])
+    noisy = np.round(np.array(found) + 0.005 * rng.normal(size=len(u)), 2)
+    assert one_effect(noisy, u, "level").delays == (delay, delay)
+
+
+def test_a_shaft_that_turns_on_does_not_rest() -> None:
+    turned = motor(np.ones(2000)) + 8.0 * np.arange(2000) * DT
+    rests = examine(Log({"th": turned, "u": turned}, states=["th"], inputs=["u"], dt=DT)).resting
+    assert not rests.any()
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_an_input_without_effect_is_said_to_explain_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -188,10 +207,22 @@ def test_likely_mistakes_of_units_are_said(seed: int) -> None:
         assert words in text
         assert "explains nothing" not in text
     for scale, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
-        assert f"--units t={unit}" in report({"t": t * scale, "th": angle, "u": u})
+        assert f"--units time={unit}" in report({"t": t * scale, "th": angle, "u": u})
     clean = report({"t": t, "th": angle, "u": u})
     assert "?" not in clean
     assert f"every {1e3 * DT:.1f} ms" in clean
+
+
+def test_a_number_that_stands_for_a_missing_one_is_said_and_left_out() -> None:
+    """Its jumps were taken for the ends of a turn, and the rest of the log for rest."""
+    u = held(np.random.default_rng(0), 2000)
+    angle = motor(u)
+    whole = report({"t": np.arange(2000) * DT, "th": angle, "u": u})
+    text = report({"t": np.arange(2000) * DT, "th": np.r_[angle[:-3], 3 * [-9999.0]], "u": u})
+    assert "th: -9999 in 3 rows, far from all others: not measured there?" in text
+    assert "wraps" not in text
+    assert "rest: nothing moves" not in text
+    assert "far from" not in whole
 
 
 def test_columns_that_are_named_like_inputs_are_and_flags_are_not_states() -> None:
@@ -204,6 +235,8 @@ def test_columns_that_are_named_like_inputs_are_and_flags_are_not_states() -> No
     ):
         log = log_of(pd.DataFrame({**base, **dict.fromkeys(names, t)}))
         assert (log.states, log.inputs) == (("th",), wanted)
+    log = log_of(pd.DataFrame({**base, "current": t, "u": t}), states=["th", "current"])
+    assert log.inputs == ("u",)
     with pytest.raises(AnalysisError, match=r"none of the columns Time, th, ok .*--inputs"):
         log_of(pd.DataFrame(base))
     with pytest.raises(SpecificationError, match="or the time between two rows as dt"):
@@ -226,14 +259,34 @@ def write_hdf5(path: Path) -> None:
         file["run/mass"] = 2.0
 
 
+def write_compound(path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        file["run"] = frame().to_records(index=False)
+
+
+def scope() -> dict[str, Any]:
+    """Return what Simulink keeps of signals, each with its label."""
+    signals = [{"values": frame()[name], "label": name} for name in ("th", "u")]
+    return {"time": frame().t, "signals": signals}
+
+
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "run.csv": lambda path: frame().to_csv(path, index=False),
     "run.csv.gz": lambda path: frame().to_csv(path, index=False),
+    "semicolons.csv": lambda path: frame().to_csv(path, index=False, sep=";", decimal=","),
+    "points.csv": lambda path: frame().to_csv(path, index=False, sep=";"),
+    "tabs.csv": lambda path: frame().to_csv(path, index=False, sep="\t"),
+    "blanks.csv": lambda path: path.write_text(frame().to_csv(index=False).replace(",", " , ")),
+    "ended.csv": lambda path: path.write_text(frame().to_csv(index=False, lineterminator=",\n")),
+    "numbered.csv": lambda path: frame().to_csv(path),
     "run.parquet": lambda path: frame().to_parquet(path),
     "run.mat": lambda path: savemat(path, {**frame().to_dict("list"), "mass": 2.0}),
     "struct.mat": lambda path: savemat(path, {"run": frame().to_dict("list")}),
+    "scope.mat": lambda path: savemat(path, {"run": scope()}),
     "run.h5": write_hdf5,
     "new.mat": write_hdf5,
+    "compound.h5": write_compound,
 }
 
 
@@ -245,13 +298,8 @@ def test_a_log_is_read_from_every_kind_of_file(name: str, tmp_path: Path) -> Non
         path.write_bytes(
             b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + bytes(384) + path.read_bytes()
         )
-    before = "run." if name in ("struct.mat", "run.h5", "new.mat") else ""
-    log = analysis.read_log(
-        path,
-        states={"th": f"{before}th"},
-        inputs={"u": f"{before}u"},
-        time=f"{before}t",
-    )
+    log = analysis.read_log(path)
+    assert [one.split(".")[-1] for one in (*log.states, *log.inputs)] == ["th", "u"]
     np.testing.assert_allclose(log.pieces[0].measured[:, 0], frame().th, atol=1e-15)
     np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
 
@@ -261,7 +309,8 @@ def test_a_log_is_read_from_every_kind_of_file(name: str, tmp_path: Path) -> Non
     [
         ("run.txt", b"", r"ends with .txt, but a log is read from .csv"),
         ("none.csv", None, "is no file"),
-        ("run.csv", b"t;th;u\n0;1,5;2\n", "separated by ';'"),
+        ("run.csv", b"# rig 3\nt,th,u\n0,1,2\n", "in UTF-8 with one line of names"),
+        ("run.csv", b"0,1.5,2\n0.01,1.6,2\n", "first line has numbers and no names"),
         ("run.csv", b"t,th,u\n", "has no rows"),
         ("run.csv", b"", "cannot be read"),
         ("run.csv.gz", b"no gzip", "cannot be read"),
@@ -311,6 +360,7 @@ def test_the_command_prints_and_draws(
     assert "1,999 rows, 2 pieces" in said
     assert "steps of 0.00314159 (2,000 a turn)" in said
     assert "suspected delay: 0 samples" in said
+    assert "in radians" not in said  # its unit was declared
     assert "pieces end there: row 1000" in said
     assert Path("figures/run.png").stat().st_size > 10_000
     assert cli.main(["log", "run.csv", *words, "--inputs", "u=", "--out", "a.pdf"]) == 2

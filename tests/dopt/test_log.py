@@ -100,12 +100,29 @@ def test_the_input_is_not_shifted_and_nothing_is_resampled() -> None:
         (np.datetime64("2026-01-01") + (T * 1e6).round().astype("timedelta64[us]"), {}),
         (pd.date_range("2026-01-01", periods=N, freq="10ms", tz="Europe/Paris"), {}),
         ([f"2026-01-01 00:00:0{k // 100}.{k % 100:02d}" for k in range(N)], {}),
+        ([f"2026-01-01T00:00:0{k // 100},{k % 100:02d}+01:00" for k in range(N)], {}),
+        ([f"2026-01-01 00:00:0{k // 100}.{k % 100:02d} Z" for k in range(N)], {}),
         ([f"{one:.2f}" for one in T], {}),
+        (T * 1e3, {"units": {"t": "1e-3"}}),
     ],
 )
 def test_stamps_of_every_kind_are_seconds_from_the_first(stamps: Any, options: Any) -> None:
     found = log(pd.DataFrame(table(t=stamps)), **options)
     np.testing.assert_allclose(found.pieces[0].time, T, atol=3e-7)
+
+
+def test_dates_may_be_missing_and_change_their_offset() -> None:
+    stamps = [f"2026-10-25 02:59:59.{k:02d}+02" for k in range(100)]
+    stamps += [f"2026-10-25T02:00:00.{k:02d}+0100" for k in range(100)]
+    stamps[0] = stamps[150] = ""
+    found = log(table(t=stamps))
+    np.testing.assert_allclose(found.pieces[0].time, T[:149], atol=1e-9)
+    np.testing.assert_allclose(found.pieces[1].time, T[150:-1], atol=1e-9)
+
+
+def test_a_clock_in_a_group_is_found() -> None:
+    found = Log({"run.t": T, "run.th": T, "run.u": T}, states=["run.th"], inputs=["run.u"])
+    np.testing.assert_array_equal(found.pieces[0].time, T)
 
 
 def test_a_counter_of_microseconds_that_begins_again_goes_on() -> None:
@@ -184,6 +201,17 @@ def test_an_angle_within_a_turn_is_unwrapped(
     assert said(found, "unwrapped")
 
 
+def test_a_glitch_is_no_turn() -> None:
+    """One value beyond a turn left every passage of its end in the angle."""
+    turning = 0.1 * np.arange(3000)
+    angle = (turning + np.pi) % (2 * np.pi) - np.pi
+    angle[1000] = 40.0
+    found = log({"t": 0.01 * np.arange(3000), "th": angle, "u": turning}, angles=["th"])
+    left = np.delete(found.pieces[0].measured[:, 0] - turning, 1000)
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+    assert said(found, "passes its end")
+
+
 def test_counts_become_radians_and_counters_go_on() -> None:
     angle = 30.0 * np.sin(2 * T)
     counts = np.round(angle / TURN * 4096).astype(np.int64)
@@ -245,6 +273,10 @@ def test_a_column_that_a_plant_needs_is_asked_for() -> None:
         ({"th": T[1:]}, {}, r"th \(199,\)"),
         ({"th": ["1,5"] * N}, {}, "'1,5' in row 0.*decimal point"),
         ({"th": ["1.5"] * 9 + ["bad"] * (N - 9)}, {}, "'bad' in row 9"),
+        ({"th": ["rad"] + ["1.5"] * (N - 1)}, {}, "'rad' in row 0.*remove the row, if it holds"),
+        ({"t": ["25.10.2026 02:00:00"] * N}, {}, "'25.10.2026 02:00:00'.*to_datetime"),
+        ({"t": ["2026-13-01"] * N}, {}, "'2026-13-01' in row 0"),
+        ({"t": T[::-1]}, {}, "sort the rows by time"),
         ({"th": T + 1j}, {}, "complex128"),
         ({"th": T * np.nan}, {}, "no value at all"),
         ({"u": np.where(np.arange(N) % 2, T, np.nan)}, {}, "ffill"),

@@ -267,14 +267,31 @@ def test_constants_and_delay_lie_within_their_errors(seed: int) -> None:
     assert not found.has_network
 
 
+def test_standard_errors_are_of_fits_without_each_window() -> None:
+    """From the residuals at the minimum alone, 90 of 100 intervals of 95 % held the truth."""
+    found = dopt.fit(declared(), run(3, 402), width=0, window=0.6)
+    model, (p, windows, _, scale, *_), _, covariance = found.physics
+    others = ~np.eye(len(scale), dtype=bool)
+    assert len(scale) < 15
+    simulator = Simulator(model, found.data)
+    left_out = [
+        solve(simulator, windows.where(one), p, 1.0, scale=scale[one], tolerance=1e-8).p
+        for one in others
+    ]
+    squares = np.sum(np.square(np.array(left_out) - p), axis=0)
+    np.testing.assert_allclose(np.diag(covariance), squares, rtol=0.01)
+
+
 def test_a_network_is_refused_where_the_constants_tell_all() -> None:
     found = dopt.fit(declared(), run(5), width=6, weights=(10.0,))
     assert not found.has_network
     assert "no network" in found.report()
+    assert "lack something" not in found.report()
 
 
 def test_a_network_is_kept_where_something_is_not_declared(fitted: Fitted) -> None:
     assert fitted.has_network
+    assert "The equations lack something" in fitted.report()
     rows = [row for row in fitted.errors() if row["horizon"] == max(fitted.horizons[:3])]
     by_model = {row["model"]: row["rms"] for row in rows}
     assert by_model["model"] < 0.7 * by_model["physics alone"] < by_model["linear"]
@@ -376,7 +393,7 @@ def test_units_of_a_state_do_not_matter() -> None:
         ({"weights": (0.0,), "width": 4}, "weights is"),
         ({"workers": 0}, "workers is 0"),
         ({"logs": []}, "no log was given"),
-        ({"logs": run(0, 6)[:2]}, "longest piece"),
+        ({"logs": run(0, 6)[:2]}, "longest piece of a block, of 2 that"),
         ({"logs": run(0, 6)[["time", "angle"]]}, "voltage"),
         ({"plant": {}}, r"dopt\.Plant is expected"),
     ],
@@ -385,6 +402,45 @@ def test_what_cannot_be_fitted_is_said(arguments: dict[str, object], said: str) 
     given = {"plant": declared(), "logs": run(0, 60), "width": 0} | arguments
     with pytest.raises(SpecificationError, match=said):
         dopt.fit(**given)  # type: ignore[arg-type]
+
+
+def test_states_that_are_measured_at_different_times_are_judged() -> None:
+    table = run(0)
+    rate = np.gradient(table.angle, table.time)
+    odd = np.arange(len(table)) % 2 == 1
+    table = table.assign(angle=table.angle.where(~odd), rate=np.where(odd, rate, np.nan))
+    both = {"angle": dopt.encoder(4096), "rate": 0.1}
+    found = dopt.fit(declared(measured=both), table, width=0, window=0.3)
+    rows = [row for row in found.errors() if row["model"] == "model"]
+    assert {row["state"] for row in rows} == {"angle", "rate"}
+    assert {row["windows"] for row in rows[2:]} == {15}
+    assert found.verdict().startswith("Useful up to 1.2 s")
+    assert min(found.coverage().values()) > 0.7
+
+
+def test_short_runs_are_judged_as_far_as_they_go() -> None:
+    """A block alone has no other ones that bound it; a run of one window is predicted."""
+    other = run(1)
+    found = dopt.fit(declared(), [run(0), other[:30], other[30:60]], width=0)
+    assert np.isnan(found.coverage()["angle"])
+    assert "Bounds of 90 % are not judged on held-out angle" in found.report()
+    for rows, words in ((60, "Useful up to 0.6 s"), (15, "Not judged: no run is long")):
+        short = dopt.fit(declared(), run(0), width=0, window=0.6, validate=other[:rows])
+        assert short.verdict().startswith(words)
+
+
+def test_stamps_in_another_unit_are_refused() -> None:
+    """They were integrated in steps of the plant's dt, for hours."""
+    table = run(0, 60)
+    for scale in (1e3, 1e-3, 1e9):
+        with pytest.raises(SpecificationError, match=r"the plant's dt of 0.02.*units={'time'"):
+            dopt.fit(declared(), table.assign(time=scale * table.time), width=0)
+
+
+def test_steps_that_are_too_long_are_said(fitted: Fitted) -> None:
+    found = dopt.fit(declared(dt=0.12), run(0)[::6], width=0)
+    assert "steps of 0.12 s are too long for these equations" in found.report()
+    assert "too long" not in fitted.report()
 
 
 def test_a_plant_without_unknowns_gets_a_network_alone() -> None:
