@@ -32,7 +32,7 @@ pytestmark = pytest.mark.xdist_group("docs")  # one database for all of them
 TUTORIAL = "docs/tutorial.md"
 STRUCTURE = "docs/structure.md"
 PLUGINS = "docs/compiled_plugins.md"
-SHARING = "docs/sharing.md"  # tests/test_sharing_page.py
+SHARING = "docs/sharing.md"  # tests/test_pages.py
 SHORT = {"env": {"horizon": 40}}
 TASK = {"task": {"name": "control", "checkpoints": [20]}}
 

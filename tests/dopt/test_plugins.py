@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,12 +16,13 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.learning import Adam
-from dopt.learning.base import CompiledLearner
+from dopt.learning.base import CompiledLearner, CustomLearner, Updater
 from dopt.policies import DOptimal
-from dopt.policies.base import CompiledPolicy
+from dopt.policies.base import CompiledPolicy, CustomPolicy, Planner
 from dopt.reference.batch import run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS, System
 from tests.dopt.custom_plugins import ANSWERS
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
@@ -30,14 +32,11 @@ from tests.typed_commands import empty_folder, run_typed
 HERE = "tests.dopt.custom_plugins"
 
 
-def specification(seed: int = 0, **sections: dict[str, Any]) -> TrialSpec:
-    usual: dict[str, Any] = {
-        "env": {"name": "pendulum", "horizon": 25, "grid_points": [4, 4]},
-        "policy": {"name": "d_optimal"},
-        "model": {"name": "mlp"},
-        "learner": {"name": "adam"},
-    }
-    return TrialSpec.from_mapping(usual | sections | {"seed": seed})
+def specification(system: str = "pendulum", seed: int = 0, /, **sections: Any) -> TrialSpec:
+    """Return a small trial; ``sections`` are whole ones in the place of the usual ones."""
+    learner = {"name": "adam"}
+    usual = trial(system, "d_optimal", seed, env={"horizon": 25}, learner=learner).to_mapping()
+    return TrialSpec.from_mapping(usual | {"path": None} | sections)
 
 
 def own(name: str, **fields: Any) -> dict[str, Any]:
@@ -81,7 +80,7 @@ def test_limits_hold_for_a_plan_in_numpy() -> None:
 
 
 def test_trials_in_lockstep_are_those_run_alone() -> None:
-    specs = [specification(seed, policy=own("Coin")) for seed in range(3)]
+    specs = [specification("pendulum", seed, policy=own("Coin")) for seed in range(3)]
     together, alone = run_trials(specs), [run_trial(spec, "reference") for spec in specs]
     for one, other in zip(together, alone, strict=True):
         np.testing.assert_allclose(one.states, other.states, rtol=1e-9)
@@ -89,24 +88,83 @@ def test_trials_in_lockstep_are_those_run_alone() -> None:
     np.testing.assert_array_equal(alone[0].inputs, run_trial(specs[0]).inputs)
 
 
-LARGE = "chose an input of norm 4 at step 5, but env.gamma is 2: scale it down"
+def answering(answer: object) -> SimpleNamespace:
+    """Return a plan whose inputs are given."""
+    return SimpleNamespace(choose=lambda _: answer, observe=print, feedback=print)
+
+
+GIVEN: dict[str, Any] = {
+    "none": None,
+    "text": "x",
+    "class": Planner,
+    "unwatching": SimpleNamespace(choose=print),
+    "silent": SimpleNamespace(update=lambda _: None),
+    "no input": answering(None),
+    "word": answering("left"),
+    "complex": answering(np.array([1j])),
+    "ragged": answering([[1.0], 2.0]),
+    "nan": answering(np.array([np.nan])),
+    "two": answering(np.ones(2)),
+    "large": answering(np.array([4.0])),
+    "long": SimpleNamespace(update=lambda view: np.append(view.parameters, 0.0)),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bringing(CustomPolicy):
+    name: ClassVar[str] = "bringing"
+    what: str = "none"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        plan: Planner = GIVEN[self.what]
+        return plan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Teaching(CustomLearner):
+    name: ClassVar[str] = "teaching"
+    what: str = "none"
+
+    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
+        update: Updater = GIVEN[self.what]
+        return update
+
+
+INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(\)"
 
 
 @PATHS
 @pytest.mark.parametrize(
-    ("parts", "sentence"),
+    ("part", "what", "sentence"),
     [
-        ({"policy": own("Wild")}, LARGE),
-        ({"policy": own("Wild", size=2)}, r"an input of shape \(2,\) at step 1, but \(1,\) is exp"),
-        ({"policy": own("Lost")}, r"returned array\(\[nan\]\) at step 5"),  # with a sound model
-        ({"learner": own("Descent", extra=1)}, "learner 'descent' returned parameters of shape"),
+        ("policy", "none", r"^planner\(\) of policy 'bringing' returned None, .*base\.Planner"),
+        ("policy", "text", r"an object of type str, .* return one that has choose, observe"),
+        ("policy", "class", r"returned the class Planner itself, .* return Planner\(\.\.\.\)"),
+        (
+            "policy",
+            "unwatching",
+            r"of type SimpleNamespace, .* return one that has observe, feedback",
+        ),
+        ("learner", "none", r"^updater\(\) of learner 'teaching' returned None, .*base\.Updater"),
+        ("learner", "text", r"returned an object of type str, .* return one that has update"),
+        ("learner", "long", "^learner 'teaching' returned parameters of shape"),
+        ("learner", "silent", r"^learner 'teaching' returned None, but parameters .* update\(\)"),
+        ("policy", "no input", INPUT.format("None")),
+        ("policy", "word", INPUT.format("'left'")),
+        ("policy", "complex", INPUT.format(r"array\(\[0\.\+1\.j\]\)")),
+        ("policy", "ragged", INPUT.format(r"\[\[1\.0\], 2\.0\]")),
+        ("policy", "nan", INPUT.format(r"array\(\[nan\]\)")),
+        ("policy", "two", r"an input of shape \(2,\) at step 1, but \(1,\) is expected"),
+        ("policy", "large", "an input of norm 4 at step 1, but env.gamma is 2: scale it down"),
     ],
 )
-def test_an_answer_that_cannot_be_is_refused(
-    parts: dict[str, Any], sentence: str, path: str
-) -> None:
-    with pytest.raises(SpecificationError, match=sentence):
-        run_trial(specification(**parts), path)
+def test_what_own_parts_return_is_checked(part: str, what: str, sentence: str, path: Any) -> None:
+    own: Any = {"policy": Bringing(what=what), "learner": Teaching(what=what)}[part]
+    system = SYSTEMS["pendulum"](horizon=5, grid_points=(4, 4))
+    spec = TrialSpec.of_system(system, **({"policy": "random"} | {part: own}))
+    with pytest.raises(SpecificationError, match=sentence) as caught:
+        run_trial(spec, path)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -210,13 +268,6 @@ def own_compiled(name: str, **fields: object) -> dict[str, object]:
     return {"_target_": f"{__name__}.{name}", **fields}
 
 
-def changed(
-    section: str, given: dict[str, object], env: str = "pendulum", **more: Any
-) -> TrialSpec:
-    mapping = trial(env, "random", 1, env={"horizon": 12}, learner={"name": "adam"}).to_mapping()
-    return TrialSpec.from_mapping({**mapping, section: given, **more})
-
-
 @pytest.mark.parametrize("env", ["pendulum", "arm"])
 @pytest.mark.parametrize(
     ("section", "target"), [("policy", "frontier.Frontier"), ("learner", "heavy_ball.HeavyBall")]
@@ -224,7 +275,7 @@ def changed(
 def test_the_examples_of_the_tutorial_mean_the_same_on_both_paths(
     env: str, section: str, target: str
 ) -> None:
-    spec = changed(section, {"_target_": target}, env)
+    spec = specification(env, **{section: {"_target_": target}})
     assert spec.config.path == "kernel"
     fast, plain = run_trial(spec), run_trial(spec, "reference")
     assert relative_gap(fast.inputs, plain.inputs) < 1e-8
@@ -235,6 +286,7 @@ COPIES = """
 import numpy as np
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS, System
 from tests.dopt.trials import trial
 
 small = {"env": {"horizon": 12}, "model": {"width": 4}, "learner": {"window": 5}}
@@ -255,8 +307,8 @@ def test_copies_of_shipped_classes_give_their_very_numbers() -> None:
 
 
 def test_a_learner_keeps_its_memory_and_its_file_is_part_of_the_key() -> None:
-    spec = changed("learner", own_compiled("Counting"))
-    assert run_trial(spec).parameters[0] == 12.0
+    spec = specification(learner=own_compiled("Counting"))
+    assert run_trial(spec).parameters[0] == 25.0
     section: Any = spec.to_mapping()["learner"]
     assert len(section["source"]) == 16
 
@@ -273,7 +325,7 @@ def test_what_a_compiled_function_may_not_do_is_one_sentence(
     section: str, name: str, more: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(SpecificationError, match=sentence) as caught:
-        run_trial(changed(section, own_compiled(name), **more))
+        run_trial(specification(**{section: own_compiled(name)}, **more))
     assert "\n" not in str(caught.value)
 
 

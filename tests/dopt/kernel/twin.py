@@ -18,7 +18,7 @@ from dopt.kernel.structs import Evaluation
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView
 from dopt.types import Array, CompiledFunction, Matrix
-from tests.dopt.newcomers import kept
+from tests.dopt.custom_plugins import kept
 
 
 def observed(trial: KernelTrial, t: int) -> Array:
