@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
-import json
 import re
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
@@ -17,7 +15,7 @@ import yaml
 
 from dopt.kernel.cache import COMPILED_SOURCES
 from tests.measure_house import code_lines
-from tests.paths import CONF, EXAMPLE, ROOT, without_coverage
+from tests.paths import CONF, EXAMPLE, ROOT, loaded_by
 
 PACKAGES = ("dopt", "orchestrate", "analysis")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
@@ -136,24 +134,9 @@ def importers(module: str) -> list[str]:
     ]
 
 
-def all_loaded_by(module: str) -> list[str]:
-    """Return all modules that are loaded once ``module`` is, in a fresh process."""
-    program = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=ROOT,
-        env=without_coverage(),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    names: list[str] = json.loads(done.stdout)
-    return names
-
-
-def loaded_by(module: str) -> set[str]:
-    """Return the top-level modules of these."""
-    return {name.split(".")[0] for name in all_loaded_by(module)}
+def tops_loaded_by(program: str) -> set[str]:
+    """Return the top-level modules that are loaded once a program has run."""
+    return {name.split(".")[0] for name in loaded_by(program)}
 
 
 def test_the_science_knows_no_effects() -> None:
@@ -165,7 +148,7 @@ def test_the_science_knows_no_effects() -> None:
 
 def test_what_saves_an_exploration_is_loaded_by_the_first_save() -> None:
     assert imports(ROOT / "dopt/explorer/saving.py") >= SAVES
-    assert not loaded_by("dopt.explorer.saving") & (EFFECTS | {"orchestrate"})
+    assert not tops_loaded_by("import dopt.explorer.saving") & (EFFECTS | {"orchestrate"})
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
@@ -247,18 +230,18 @@ def test_numbers_load_neither_matplotlib_nor_what_runs_trials() -> None:
     assert len(modules) > 10
     modules += ["analysis.report", "analysis.outputs", "analysis.cli"]
     heavy = {"matplotlib", "torch", "ray", "hydra", "numba"}
-    assert not loaded_by(", ".join(modules)) & heavy
+    assert not tops_loaded_by(f"import {', '.join(modules)}") & heavy
 
 
 def test_a_specification_loads_numpy_and_nothing_heavier() -> None:
-    always = loaded_by("sys")  # such as Debian's sitecustomize
-    loaded = loaded_by(", ".join(module_name(path) for path in sources("dopt/spec")))
-    third_party = loaded - always - set(sys.stdlib_module_names)
+    always = tops_loaded_by("")  # such as Debian's sitecustomize
+    modules = ", ".join(module_name(path) for path in sources("dopt/spec"))
+    third_party = tops_loaded_by(f"import {modules}") - always - set(sys.stdlib_module_names)
     assert {name for name in third_party if not name.startswith("_")} <= {"dopt", "numpy"}
 
 
 def test_the_store_loads_at_most_five_modules_of_the_science() -> None:
-    names = all_loaded_by("orchestrate.store")
+    names = loaded_by("import orchestrate.store")
     assert len([name for name in names if name.split(".")[0] == "dopt"]) <= 5
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +24,7 @@ from dopt.systems import SYSTEMS, System
 from tests.dopt.custom_plugins import ANSWERS
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
-from tests.paths import EXAMPLE, ROOT
+from tests.paths import EXAMPLE, ROOT, printed
 from tests.typed_commands import empty_folder, run_typed
 
 HERE = "tests.dopt.custom_plugins"
@@ -211,7 +209,7 @@ def test_torch_is_loaded_where_a_trial_needs_it_and_no_sooner() -> None:
         "run_trial(in_torch); assert 'torch' in sys.modules; "
         "assert 'torch._dynamo' not in sys.modules"  # its compiler, which takes a second to load
     )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+    printed(program)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,8 +300,7 @@ for section, name, fields in (("policy", "OwnDOptimal", {}), ("learner", "OwnAda
 
 def test_copies_of_shipped_classes_give_their_very_numbers() -> None:
     """In the interpreter, which takes a second: compiling the two takes twenty."""
-    plain = os.environ | {"DOPT_PLAIN": "1"}
-    subprocess.run([sys.executable, "-c", COPIES], check=True, cwd=ROOT, env=plain)
+    printed(COPIES, DOPT_PLAIN="1")
 
 
 def test_a_learner_keeps_its_memory_and_its_file_is_part_of_the_key() -> None:

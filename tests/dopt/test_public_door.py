@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
-import json
 import logging
 import os
 import pwd
 import pydoc
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,24 +20,15 @@ from dopt import process
 from dopt.errors import SpecificationError, _say_once, given_path, unknown_name
 from orchestrate.runner.saving import launch_record
 from tests.dopt.explorer.plants import MOTOR
-from tests.paths import ROOT
+from tests.paths import ROOT, loaded_by, printed
 
 HEAVY = {"torch", "ray", "numba", "hydra", "sqlalchemy", "matplotlib", "pandas", "scipy"}
-
-
-def loaded_by(program: str) -> set[str]:
-    """Return the top-level modules that a program loads in a fresh process."""
-    shown = f"{program}\nimport json, sys; print(json.dumps(sorted(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", shown], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return {name.split(".")[0] for name in json.loads(done.stdout)}
 
 
 def test_the_import_loads_no_library_and_a_specification_numpy_alone() -> None:
     program = "import sys, dopt; assert not {'numpy', 'scipy', 'numba'} & sys.modules.keys(); "
     program += "dopt.TrialSpec.from_names('pendulum', 'd_optimal'); dopt.TrialResult"
-    assert not loaded_by(program) & HEAVY
+    assert not {name.split(".")[0] for name in loaded_by(program)} & HEAVY
 
 
 def test_every_public_name_is_there() -> None:
@@ -302,7 +290,4 @@ print("done")
 
 
 def test_log_fit_and_explorer_run(tmp_path: Path) -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=tmp_path, capture_output=True, text=True, timeout=300
-    )
-    assert run.stdout.strip() == "done", run.stderr
+    assert printed(PROGRAM, folder=tmp_path, PYTHONPATH=str(ROOT)) == "done\n"

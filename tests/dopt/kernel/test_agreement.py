@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -36,7 +33,7 @@ from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.kernel.twin import interpreted, relative_gap, run
 from tests.dopt.trials import LEARNERS as FIXED
 from tests.dopt.trials import PAIRS, SMALL_GRIDS, SMALL_SEARCHES, covering, trial
-from tests.paths import ROOT
+from tests.paths import printed
 
 ENVS = ("arm", "mass_spring", "pendulum")
 """Systems of which the first one that a choice fits is taken."""
@@ -296,14 +293,6 @@ def test_the_same_trial_gives_the_same_bits_whatever_ran_before() -> None:
         assert again == expected, spec.config.label
 
 
-def output(command: list[str], **variables: str) -> str:
-    """Return what a process prints, which may not fail."""
-    done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | variables, stdout=subprocess.PIPE, text=True, check=True
-    )
-    return done.stdout
-
-
 def test_another_process_gives_the_same_bits() -> None:
     program = (
         "from dopt.run import run_trial\n"
@@ -311,8 +300,7 @@ def test_another_process_gives_the_same_bits() -> None:
         "result = run_trial(trial('cartpole', 'd_optimal', 8))\n"
         f"print(b''.join(getattr(result, name).tobytes() for name in {NUMBERS}).hex())"
     )
-    found = bytes.fromhex(output([sys.executable, "-c", program]))
-    assert found == numbers(run_trial(trial("cartpole", "d_optimal", 8)))
+    assert bytes.fromhex(printed(program)) == numbers(run_trial(trial("cartpole", "d_optimal", 8)))
 
 
 def test_seeds_share_what_they_are_told_apart_by() -> None:
@@ -350,8 +338,8 @@ EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
 
 def test_the_kernel_in_plain_python_gives_the_same_trials() -> None:
     given = json.dumps([spec.to_mapping() for spec in PLAIN_TRIALS])
-    command = [sys.executable, "-c", PLAIN_PROGRAM, given, *EXACT, *SINGLE]
-    for spec, found in zip(PLAIN_TRIALS, json.loads(output(command, DOPT_PLAIN="1")), strict=True):
+    plain = json.loads(printed(PLAIN_PROGRAM, given, *EXACT, *SINGLE, DOPT_PLAIN="1"))
+    for spec, found in zip(PLAIN_TRIALS, plain, strict=True):
         compiled = run_trial(spec)
         for name in EXACT:
             values = getattr(compiled, name)

@@ -34,7 +34,7 @@ from dopt.policies import POLICIES
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt import trials
-from tests.paths import ROOT, loaded
+from tests.paths import ROOT, loaded, printed
 from tests.waiting import PATIENCE_SECONDS
 
 MODULE = "A, B = 1.0, 2.0\n\ndef triple(x, out):\n    out[0] = (A + B) * x\n"
@@ -413,16 +413,6 @@ class TestReports:
             Compilers(patched, minutes=1)
             cache.compile_missing(["loop"])
             assert caplog.messages
-
-
-def printed(program: str, *words: str, folder: Path = ROOT, **environment: str) -> str:
-    """Return what a program prints that runs in a process of its own, which may not fail."""
-    command = [sys.executable, "-c", program, *words]
-    given = os.environ | environment
-    done = subprocess.run(
-        command, env=given, cwd=folder, stdout=subprocess.PIPE, text=True, check=True
-    )
-    return done.stdout
 
 
 def cache_without(folder: Path, *names: str) -> str:
