@@ -33,11 +33,13 @@ from tests.dopt.custom_plugins import kept
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 
+ALL = [*(cls() for cls in SYSTEMS.values()), Chain(n_links=3)]
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_compiled_equations_are_those_of_the_system(name: str) -> None:
-    system, rng = SYSTEMS[name](), np.random.default_rng(0)
-    equations, p = compiled_equations(system), np.array(SYSTEMS[name]().parameters)
+
+@pytest.mark.parametrize("system", ALL, ids=lambda system: f"{system.name}-{system.n_states}")
+def test_compiled_equations_are_those_of_the_system(system: System) -> None:
+    rng = np.random.default_rng(0)
+    equations, p = compiled_equations(system), np.array(system.parameters)
     x, u = rng.standard_normal(system.n_states), rng.standard_normal(system.n_inputs)
     known, learned = np.empty(system.n_states), np.empty(system.n_learned)
     equations.known(x, u, p, known)
