@@ -65,12 +65,6 @@ def test_every_function_of_the_map_from_the_paper_exists() -> None:
         assert callable(attrgetter(name)(module)), f"{path}:{name}"
 
 
-def test_every_module_at_the_top_of_dopt_has_a_line() -> None:
-    tree = PAGES[STRUCTURE].split("\norchestrate/")[0]
-    modules = {path.name for path in (ROOT / "dopt").glob("*.py")} - {"__init__.py"}
-    assert set(re.findall(r"^  (\w+\.py) ", tree, flags=re.MULTILINE)) == modules
-
-
 # Which commands a reader types
 
 

@@ -19,7 +19,6 @@ from studies.conclusions.__main__ import PARTS, complete, main
 from studies.conclusions.trials import Cell, Row
 from tests.dopt.oracles.test_oracles import filtered
 from tests.dopt.trials import trial
-from tests.pages import DOCS
 
 KEYS = tables.KEYS
 
@@ -30,12 +29,6 @@ def losses(*cell: str) -> pd.Series[float]:
 
 def geometric(values: pd.Series[float]) -> float:
     return float(np.exp(np.log(values).mean()))
-
-
-def test_the_page_has_the_tables_of_its_rows() -> None:
-    page = (DOCS / "conclusions.md").read_text() + (DOCS / "findings.md").read_text()
-    for made in (*tables.TABLES, *tables.OTHERS):
-        assert f"<!-- table: {made.__name__} -->\n{made()}<!-- end -->" in page
 
 
 def test_the_headlines_have_a_hundred_seeds_that_nothing_was_tuned_on() -> None:

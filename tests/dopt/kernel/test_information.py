@@ -142,19 +142,6 @@ def test_numbers_below_rounding_end_the_trial_as_diverged(policy: str, sections:
     assert np.isnan(result.loss[result.diverged_at :]).all()
 
 
-def test_stored_trials_keep_their_keys() -> None:
-    plain = trial("arm", "d_optimal", 1)
-    said = trial("arm", "d_optimal", 1, policy={"information": "accumulated", "refresh_every": 1})
-    assert said.trial_key == plain.trial_key
-    assert '"information"' not in plain.canonical_json()
-    assert '"refresh_every"' not in plain.canonical_json()
-    fresh = trial("arm", "d_optimal", 1, policy=FRESH)
-    seldom = trial("arm", "d_optimal", 1, policy=FRESH | {"refresh_every": 5})
-    assert len({spec.trial_key for spec in (plain, fresh, seldom)}) == 3
-    for spec in (plain, fresh, seldom):
-        assert TrialSpec.from_mapping(spec.to_mapping()) == spec
-
-
 LEAST_SQUARES = {"learner": {"name": "recursive_least_squares"}}
 OTHER_MODEL = r"goes with model 'mlp', 'affine', 'black_box' or 'grey_box', but model '{}'"
 
