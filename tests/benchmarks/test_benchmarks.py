@@ -8,7 +8,6 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -24,7 +23,6 @@ from benchmarks.processes import _accounts
 from benchmarks.rows import Anchor, Row, Target, Timing
 from benchmarks.trials import CYCLE, cost, step_us
 from dopt.result import TrialResult
-from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.paths import ROOT
 
@@ -142,11 +140,20 @@ def test_a_line_that_is_no_run_is_named(past: Path) -> None:
         read(past)
 
 
-@pytest.mark.parametrize(("value", "slow"), [(119.0, False), (121.0, True), (50.0, False)])
+@pytest.mark.parametrize(
+    ("value", "unit_seconds", "slow"),
+    [
+        (119.0, 0.01, False),
+        (121.0, 0.01, True),
+        (50.0, 0.01, False),
+        (200.0, 0.02, False),  # of a machine that is slow in all
+        (100.0, 0.005, True),
+    ],
+)
 def test_a_row_is_slower_at_a_fifth_more_than_the_median(
-    past: Path, value: float, slow: bool
+    past: Path, value: float, unit_seconds: float, slow: bool
 ) -> None:
-    assert bool(slower(read(past), run(value))) is slow
+    assert bool(slower(read(past), run(value, unit_seconds))) is slow
 
 
 def test_a_rate_is_slower_when_it_falls() -> None:
@@ -156,13 +163,9 @@ def test_a_rate_is_slower_when_it_falls() -> None:
     assert str(found) == "step: D-optimal: 2.00 times the median of 3 runs"
 
 
-def test_a_slow_machine_is_not_a_slow_row(past: Path) -> None:
-    assert not slower(read(past), run(200.0, unit_seconds=0.02))
-    assert slower(read(past), run(100.0, unit_seconds=0.005))
-
-
 def test_a_run_is_compared_with_those_on_its_kind_of_processor(past: Path) -> None:
     runs = read(past)
+    assert not slower(runs[:2], run(1000.0)), "two runs are no median"
     assert not slower(runs, run(170.0, processor="other"))
     (found,) = slower(runs, run(210.0, processor="other"))
     assert str(found) == "step: D-optimal: 2.10 times the median of 3 runs on all processors"
@@ -170,10 +173,6 @@ def test_a_run_is_compared_with_those_on_its_kind_of_processor(past: Path) -> No
     assert not slower(runs, run(200.0, processor="other"))
     assert slower(runs, run(210.0, processor="other"))
     assert slower(runs, run(121.0))
-
-
-def test_two_runs_are_no_median(past: Path) -> None:
-    assert not slower(read(past)[:2], run(1000.0))
 
 
 def test_what_is_no_time_is_left_out() -> None:
@@ -237,20 +236,13 @@ def test_a_slower_step_is_found_beside_other_processes(busy: float, slowdown: fl
     assert found.times == pytest.approx(slowdown, rel=0.05)
 
 
-def test_a_slower_kernel_is_found_where_it_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_row_of_a_step_is_what_its_trials_took_to_plan_and_learn(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def half_as_long_again(spec: TrialSpec) -> TrialResult:
-        result = run_trial(spec)
-        return replace(result, plan_us=1.5 * result.plan_us, learn_us=1.5 * result.learn_us)
-
-    past, new = tmp_path / "past.jsonl", tmp_path / "new.jsonl"
-    for _ in range(FEWEST):
-        assert main(["--quick", "--only", "step", "--history", str(past)]) == 0
-    monkeypatch.setattr(kernel, "run_trial", half_as_long_again)
-    command = ["--quick", "--only", "step", "--history", str(new), "--against", str(past)]
-    assert main(command) == 1
-    assert "slower: step: D-optimal, window of 100: 1." in capsys.readouterr().out
+    taken = SimpleNamespace(plan_us=np.full(500, 100.0), learn_us=np.full(500, 50.0))
+    monkeypatch.setattr(kernel, "run_trial", lambda _: taken)
+    rows = kernel.step(quick=True)[:4]
+    assert [row.value for row in rows] == pytest.approx([150.0] * 4)
 
 
 def test_the_stored_history_holds_enough_runs_of_what_is_checked() -> None:
