@@ -33,10 +33,10 @@ from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, CoupledPendulums
 from dopt.types import Array
-from tests.dopt.kernel.twin import interpreted, observed
+from tests.dopt.kernel.twin import interpreted
 from tests.dopt.oracles.test_oracles import filtered
 from tests.dopt.oracles.traces import jacobian as complex_jacobian
-from tests.dopt.oracles.traces import model_step
+from tests.dopt.oracles.traces import model_step, observed
 from tests.dopt.test_limits import ANGLE, DEGREE, sensed
 from tests.dopt.trials import trial, uniform_samples
 
@@ -124,7 +124,7 @@ def test_recorded_samples_are_what_the_learner_was_given(env: str) -> None:
     running = KernelTrial(spec)
     running.advance(spec.system.horizon)
     samples = recorded_samples(spec.system, running.record.states, running.record.inputs)
-    given = observed(running, running.done)
+    given = observed(spec, running.record)
     np.testing.assert_allclose(samples.accelerations, given, rtol=5e-10, atol=5e-10)
     assert np.array_equal(samples.states, rerun(spec, [spec.system.horizon]).states[:-1])
 

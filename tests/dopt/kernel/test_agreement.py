@@ -179,9 +179,6 @@ def test_the_kernel_does_not_pretend_to_run_what_it_lacks() -> None:
     ("what", "sections"),
     [
         ("policy 'exact'", {"policy": {"name": "exact"}}),
-        ("model 'affine'", {"model": {"name": "affine"}}),
-        ("model 'ensemble'", {"model": {"name": "ensemble"}, "learner": {"name": "gauss_newton"}}),
-        ("learner 'ekf'", {"learner": {"name": "ekf"}}),
         ("policy.information 'fresh'", {"policy": {"name": "d_optimal", "information": "fresh"}}),
         ("limits", {"limits": {"bounds": {"φ": [-1.0, 1.0]}}}),
         (

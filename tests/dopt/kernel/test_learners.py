@@ -24,8 +24,8 @@ from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.dopt.custom_networks import model_of_one
 from tests.dopt.kernel import twin
-from tests.dopt.kernel.twin import model_of_kernel, observed, relative_gap
-from tests.dopt.oracles.traces import jacobian, model_step
+from tests.dopt.kernel.twin import model_of_kernel, relative_gap
+from tests.dopt.oracles.traces import jacobian, model_step, observed
 from tests.dopt.trials import trial
 
 GAUSS_NEWTON = {"name": "gauss_newton"}
@@ -49,8 +49,9 @@ def advanced(
 
 def linearized(fast: KernelTrial, theta: Array, first: int = 0) -> tuple[Array, Array]:
     """Return J, (n r, q), and e, (n r,), of the samples from ``first`` on."""
-    system, states = fast.spec.system, fast.record.states[first : fast.done]
-    errors = observed(fast, fast.done)[first:] - fast.spec.model.predict(system, theta, states)
+    states = fast.record.states[first : fast.done]
+    targets = observed(fast.spec, fast.record)[first : fast.done]
+    errors = targets - fast.spec.model.predict(fast.spec.system, theta, states)
     return jacobian(fast.spec, theta, states).reshape(-1, len(theta)), errors.ravel()
 
 
@@ -167,7 +168,7 @@ def test_a_step_follows_the_gradient_over_the_newest_samples_in_the_drawn_places
         fast.advance(t + 1)
         kept[t % 7] = t
         times = [kept[place] for place in places[t, 0].tolist()]
-        states, targets = map(torch.tensor, (fast.record.states, observed(fast, t + 1)))
+        states, targets = map(torch.tensor, (fast.record.states, observed(spec, fast.record)))
         expected = grad(loss)(before, states[times], targets[times])
         scale = float(expected.abs().max())
         # Without momentum the first moment of Adam is the gradient itself.
