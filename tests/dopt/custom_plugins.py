@@ -150,14 +150,6 @@ class Descent(CustomLearner):
         return DescentUpdater()
 
 
-@dataclass(frozen=True, kw_only=True)
-class TaughtInTorch(Descent):
-    """Says that it is written in torch."""
-
-    name: ClassVar[str] = "taught_in_torch"
-    compiled: ClassVar[bool] = False
-
-
 class DescentUpdater(Updater):
     def __init__(self) -> None:
         self._first, self._second = np.zeros(1), np.zeros(1)

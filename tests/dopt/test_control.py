@@ -319,13 +319,10 @@ class Steady(TaskPolicy):
     reads_inputs: ClassVar[bool] = True
 
     def task_planner(self, system: System, goal: Goal, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return SteadyPlan(goal)
+        return SteadyPlan()
 
 
 class SteadyPlan(Planner):
-    def __init__(self, goal: Goal) -> None:
-        self.goal = goal
-
     def choose(self, view: TrialView) -> Array:
         return np.zeros(view.system.n_inputs)
 

@@ -150,6 +150,7 @@ HERE = __name__
         ("policy", f"{HERE}.Nameless", {}, "a class with a 'name' of its own"),
         ("policy", f"{HERE}.Thief", {}, "a class with a 'name' of its own"),
         ("policy", f"{HERE}.Closed", {}, "derive it from OpenLoop or CustomPolicy"),
+        ("policy", "tests.dopt.custom_plugins.InTorch", {}, r"numpy, .* from CompiledPolicy\.$"),
         ("policy", "__main__.Nowhere", {}, r"policy is of the class .*into a file"),
     ],
 )

@@ -190,13 +190,6 @@ def test_a_plan_that_gets_lost_with_its_model_ends_its_trial_alone(path: str) ->
     assert np.isnan(result.loss[5:]).all()
 
 
-@pytest.mark.parametrize("part", ["policy", "learner"])
-def test_what_was_written_in_torch_is_told_where_to_go(part: str) -> None:
-    """The sentence names both doors, numpy and the compiled kernel."""
-    with pytest.raises(SpecificationError, match=rf"numpy .* Compiled{part.capitalize()}\.$"):
-        specification(**{part: own("InTorch" if part == "policy" else "TaughtInTorch")})
-
-
 def test_torch_is_loaded_where_a_trial_needs_it_and_no_sooner() -> None:
     """The driver of a grid only makes the specification, and sends it to its workers."""
     plain = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()

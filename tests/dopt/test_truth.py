@@ -16,7 +16,6 @@ from dopt.control.planning import forecast_by, forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, simulate
 from dopt.models import MLP, RFF, Ensemble, Linear
-from dopt.models.base import Model
 from dopt.randomness import _STREAMS, draw, stream
 from dopt.reference.batch import run_trials
 from dopt.result import TrialResult
@@ -339,14 +338,10 @@ def test_every_model_is_rolled_as_its_predictions_say(name: str) -> None:
         parameters = np.random.default_rng(1).standard_normal(model.n_parameters(system))
         if isinstance(model, Linear):  # drags brake, and are small enough for the Euler map
             parameters = 0.01 * np.abs(parameters)
-        predicted = functools.partial(predict, model, system, parameters)
-        expected = forecast_by(system, predicted)(*asked(system))
+        predict = functools.partial(model.predict, system, parameters)
+        expected = forecast_by(system, predict)(*asked(system))
         found = model_forecast(system, model, parameters)(*asked(system))
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def predict(model: Model, system: System, theta: np.ndarray, x: np.ndarray, u: np.ndarray) -> Any:
-    return model.predict(system, theta, x, u)
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))

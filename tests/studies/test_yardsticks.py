@@ -84,16 +84,23 @@ def test_the_true_model_is_left_with_the_noise_and_none_with_the_motion() -> Non
     assert TEST_SAMPLES == 2000
 
 
+def follows(
+    made: Made, name: str, keys: list[str], value: str, compared: tuple[Any, str]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Check the medians and a ratio of a table; return it, and the values of its trials by seed."""
+    trials, table = made.read(f"{name}_trials"), made.read(name).set_index(keys)
+    by_seed = trials.pivot_table(index="seed", columns=keys, values=value)[table.index]
+    assert table["median"].to_numpy() == pytest.approx(by_seed.median().to_numpy())
+    logs = np.log(by_seed[compared] / by_seed[compared[0], "random"])
+    assert table.ratio[compared] == pytest.approx(np.exp(logs.mean()))
+    return table, by_seed
+
+
 def test_medians_counts_and_ratios_of_disks_follow_from_the_trials(made: Made) -> None:
+    table, errors = follows(made, "active_sysid", ["enforced", "policy"], "error", (True, "gsx"))
+    assert (table.reached == (errors <= 0.83).sum()).all()
     assert "published: idw" in made.shown
     assert "| rate within 4.5 rad/s" in made.shown
-    trials = made.read("active_sysid_trials")
-    table = made.read("active_sysid").set_index(["enforced", "policy"])
-    by_seed = trials.pivot_table(index="seed", columns=["enforced", "policy"], values="error")
-    assert table["median"].to_numpy() == pytest.approx(by_seed.median()[table.index].to_numpy())
-    assert (table.reached == (by_seed <= 0.83).sum()[table.index]).all()
-    logs = np.log(by_seed[True, "gsx"] / by_seed[True, "random"])
-    assert table.ratio[True, "gsx"] == pytest.approx(np.exp(logs.mean()))
 
 
 def test_a_trial_that_diverged_counts_with_an_infinite_error(tmp_path: Path) -> None:
@@ -153,16 +160,10 @@ def test_samples_are_those_after_which_the_error_stays_small(made: Made) -> None
         assert row["final_error"] == pytest.approx(errors[-1], rel=1e-6)
 
 
-def test_medians_and_ratios_follow_from_the_trials(made: Made) -> None:
-    trials = made.read("flex_table3_trials")
-    for row in made.read("flex_table3").to_dict("records"):
-        of_size = trials[trials.n_pendulums == row["n_pendulums"]].pivot_table(
-            index="seed", columns="policy", values="samples"
-        )
-        assert row["median"] == of_size[row["policy"]].median()
-        if row["policy"] != "random":
-            logs = np.log(of_size[row["policy"]] / of_size["random"])
-            assert row["ratio"] == pytest.approx(np.exp(logs.mean()))
+def test_medians_and_ratios_of_pendulums_follow_from_the_trials(made: Made) -> None:
+    for size in (1, 2):
+        keys = ["n_pendulums", "policy"]
+        follows(made, "flex_table3", keys, "samples", (size, "d_optimal"))
     assert "published: FLEX" in made.shown
     assert table_3.published_exponent("FLEX") == pytest.approx(1.18, abs=0.005)
 
@@ -207,14 +208,9 @@ def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(made
 
 
 def test_medians_counts_and_ratios_of_stars_follow_from_the_trials(made: Made) -> None:
-    trials = made.read("flex_star_trials")
-    table = made.read("flex_star").set_index(["learner", "policy"])
-    by_seed = trials.pivot_table(index="seed", columns=["learner", "policy"], values="error")
-    assert (table["median"] == by_seed.median().reindex(table.index)).all()
-    assert (table.lost == (by_seed > 0.5).sum().reindex(table.index)).all()
     learner = "adam, rate 0.02"
-    logs = np.log(by_seed[learner, "exact"] / by_seed[learner, "random"])
-    assert table.ratio[learner, "exact"] == pytest.approx(np.exp(logs.mean()))
+    table, errors = follows(made, "flex_star", ["learner", "policy"], "error", (learner, "exact"))
+    assert (table.lost == (errors > 0.5).sum()).all()
 
 
 SOLVED = {
