@@ -85,6 +85,7 @@ def test_a_plant_is_read_back_from_its_section(plant: Plant) -> None:
     [
         ({"states": {}}, "a plant has no states"),
         ({"states": {"angle": "rad", "2": "V"}}, "has the name '2'"),
+        ({"states": {"angle": "rad", "lambda": "V"}}, "has the name 'lambda'"),
         ({"states": {"sin": "rad", "rate": "rad/s"}}, "a function of expressions"),
         ({"inputs": {"rate": "V"}}, "'rate' more than once"),
         ({"learned": ["speed"]}, "'learned' of a plant 'speed' is unknown"),
@@ -99,12 +100,14 @@ def test_a_plant_is_read_back_from_its_section(plant: Plant) -> None:
         ({"gamma": "6"}, "'gamma' of a plant is '6'"),
         ({"limit": float("inf")}, "'limit' of a plant is inf"),
         ({"constants": {"gain": float("nan")}}, "'constants['gain']' of a plant is nan"),
+        ({"constants": {"_gain": 1.0}}, "has the name '_gain'"),
         ({"constants": {"\u00b5": 1.0}}, "has the name '\u00b5'"),
         ({"known": {"angle": "rate", "rate": "voltage**2"}}, "not affine in its inputs"),
         ({"known": {"rate": "gain * magnitude(voltage)"}}, "not affine in its inputs"),
         ({"known": {"rate": "where(voltage > 0, gain, 1) * voltage"}}, "not affine"),
         ({"known": {"rate": "voltage * 9**9**9"}}, "the known part of a plant fails"),
         ({"known": {"rate": "voltage | 1"}}, "holds voltage | 1"),
+        ({"known": {"rate": "(angle > 0) * voltage"}}, "holds angle > 0"),
         (
             {"known": {"rate": "where(0 < angle < 1, 1, 2) * voltage"}},
             "not one comparison by < or >",
