@@ -36,20 +36,11 @@ SHARING = "docs/sharing.md"  # tests/test_pages.py
 SHORT = {"env": {"horizon": 40}}
 TASK = {"task": {"name": "control", "checkpoints": [20]}}
 
+OTHERS = {"sh", "export", "docker", "mkdir", "git", "make", "set", "ray", "kubectl"}
 SHELL = {
     "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_explorer.py
     "docs/install.md": {".", "make"},
-    "docs/many_machines.md": {
-        "sh",
-        "export",
-        "docker",
-        "mkdir",
-        "git",
-        "make",
-        "set",
-        "ray",
-        "kubectl",
-    },
+    "docs/many_machines.md": OTHERS,
     "README.md": {"make"},
 }
 """Programs that no test here runs, by page; those of three machines have tests of their own."""

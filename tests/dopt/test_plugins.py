@@ -16,7 +16,7 @@ from dopt.errors import SpecificationError
 from dopt.learning import Adam
 from dopt.learning.base import CompiledLearner, CustomLearner, Updater
 from dopt.policies import DOptimal
-from dopt.policies.base import CompiledPolicy, CustomPolicy, Planner
+from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, Planner
 from dopt.reference.batch import run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -105,6 +105,10 @@ GIVEN: dict[str, Any] = {
     "two": answering(np.ones(2)),
     "large": answering(np.array([4.0])),
     "long": SimpleNamespace(update=lambda view: np.append(view.parameters, 0.0)),
+    "flat": np.ones(5),
+    "wide": np.ones((5, 4)),
+    "far": np.full((5, 1), 1e3),
+    "lost": np.full((5, 1), np.nan),
 }
 
 
@@ -126,6 +130,15 @@ class Teaching(CustomLearner):
     def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
         update: Updater = GIVEN[self.what]
         return update
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing(OpenLoop):
+    name: ClassVar[str] = "drawing"
+    what: str = "flat"
+
+    def inputs(self, system: System, rng: np.random.Generator) -> Any:  # noqa: ARG002
+        return GIVEN[self.what]
 
 
 INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(\)"
@@ -154,12 +167,16 @@ INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(
         ("policy", "nan", INPUT.format(r"array\(\[nan\]\)")),
         ("policy", "two", r"an input of shape \(2,\) at step 1, but \(1,\) is expected"),
         ("policy", "large", "an input of norm 4 at step 1, but env.gamma is 2: scale it down"),
+        ("inputs", "flat", r"of shape \(5,\) .* of shape \(5, 1\) are expected: correct its"),
+        ("inputs", "wide", r"of shape \(5, 4\) .* of shape \(5, 1\) are expected"),
+        ("inputs", "far", r"an input of norm 1000, but env\.gamma is 2: scale it down"),
+        ("inputs", "lost", r"an input of norm nan, but env\.gamma is 2"),
     ],
 )
 def test_what_own_parts_return_is_checked(part: str, what: str, sentence: str, path: Any) -> None:
-    own: Any = {"policy": Bringing(what=what), "learner": Teaching(what=what)}[part]
+    own: Any = {"policy": Bringing, "learner": Teaching, "inputs": Drawing}[part](what=what)
     system = SYSTEMS["pendulum"](horizon=5, grid_points=(4, 4))
-    spec = TrialSpec.of_system(system, **({"policy": "random"} | {part: own}))
+    spec = TrialSpec.of_system(system, **({"policy": "random"} | {own.section: own}))
     with pytest.raises(SpecificationError, match=sentence) as caught:
         run_trial(spec, path)
     assert "\n" not in str(caught.value)

@@ -11,7 +11,6 @@ import pydoc
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import dopt
@@ -71,19 +70,6 @@ def test_a_type_checker_sees_the_names_where_they_are() -> None:
     }
     assert seen == dopt._MODULES
     assert set(dopt.__all__) == {*seen, "__version__"}
-
-
-def test_a_trial_runs_from_the_names_alone() -> None:
-    env = {"name": "pendulum", "horizon": 20}
-    spec = dopt.TrialSpec.from_names(env, "d_optimal")
-    result = dopt.run_trial(spec)
-    assert len({result, dopt.run_trial(spec)}) == 2, "results compare by identity"
-    assert isinstance(result, dopt.TrialResult)
-    assert result.states.shape == (21, 2)
-    error = spec.model.predict(spec.system, result.parameters, spec.system.grid())
-    error -= spec.system.learned(spec.system.grid())
-    rms = np.sqrt(np.mean(np.sum(error**2, axis=1)))
-    assert result.final_loss == pytest.approx(rms, rel=1e-4)
 
 
 NAMES = ("random", "d_optimal", "first/random_held", "first/prbs", "second/exact", "second/max")

@@ -212,7 +212,8 @@ def test_a_state_beyond_the_limit_from_the_start_leaves_no_row() -> None:
 
 
 def test_the_properties_of_a_whole_trial() -> None:
-    result = run_trial(trial("pendulum", "random"))
+    result, again = (run_trial(trial("pendulum", "random")) for _ in range(2))
+    assert len({result, again}) == 2, "results compare by identity"
     assert (result.diverged, result.diverged_at, result.n_steps) == (False, None, 30)
     assert result.final_loss == result.loss[-1]
     assert result.best_loss == result.loss.min()
