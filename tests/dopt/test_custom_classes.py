@@ -139,12 +139,7 @@ HERE = __name__
         ("env", "Boat", {}, r"env\._target_.* cannot be imported"),
         ("env", "vehicle.np", {}, r"env\._target_.* a dataclass derived from dopt's System"),
         ("env", "vehicle.Staircase", {}, r"env\._target_.* derived from dopt's System"),
-        (
-            "env",
-            "dopt.systems.base.System",
-            {},
-            r"env\._target_.* defines accelerations, known",
-        ),
+        ("env", "dopt.systems.base.System", {}, r"env\._target_.* defines accelerations, known"),
         ("env", "vehicle.Boat", {"name": "ship"}, "is called 'boat'"),
         ("env", "vehicle.Boat", {"mas": 3.0}, r"env\.boat field"),
         ("policy", f"{HERE}.Nameless", {}, "a class with a 'name' of its own"),

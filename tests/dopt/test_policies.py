@@ -112,11 +112,7 @@ def test_the_square_wave_has_the_signs_of_the_sine_and_twice_its_energy(env: str
 
 @pytest.mark.parametrize(
     ("policy", "env", "share"),
-    [
-        ("multisine", "pendulum", 1 / 3),
-        ("multisine", "arm", 1 / 3),
-        ("chirp", "pendulum", 0.5),
-    ],
+    [("multisine", "pendulum", 1 / 3), ("multisine", "arm", 1 / 3), ("chirp", "pendulum", 0.5)],
 )
 def test_the_mean_square_of_inputs_is_the_stated_share(policy: str, env: str, share: float) -> None:
     energies = [

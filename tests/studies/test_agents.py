@@ -90,8 +90,7 @@ def test_an_action_of_zero_has_an_input_of_the_full_energy() -> None:
 def test_the_transitions_follow_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[tuple[np.ndarray, ...]] = []
     monkeypatch.setattr(
-        "studies.agents.policies.Agent.remember",
-        lambda _, *parts: kept.append(parts),
+        "studies.agents.policies.Agent.remember", lambda _, *parts: kept.append(parts)
     )
     monkeypatch.setattr("studies.agents.policies.Agent.learn", lambda *_: None)
     spec = agent_trial("pendulum", "SoftActorCritic")
