@@ -1,4 +1,4 @@
-"""Folders of the repository that tests read, and programs that they start."""
+"""Folders of the repository that tests read, and programs and servers that they start."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ import json
 import os
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import ModuleType
 
@@ -48,3 +53,20 @@ def _printed(words: list[str], folder: Path, variables: dict[str, str]) -> str:
         command, cwd=folder, env=variables, stdout=subprocess.PIPE, text=True, check=True
     )
     return done.stdout
+
+
+class _Silent(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None: ...
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve the files of a folder, and yield the address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Silent, directory=folder)) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()

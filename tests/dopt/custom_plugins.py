@@ -57,16 +57,6 @@ class Answer(Planner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lost(CustomPolicy):
-    """Gets lost at step 5."""
-
-    name: ClassVar[str] = "lost"
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return Answer(lambda view: np.array([np.nan]) if view.t >= 5 else 0.0 * view.inputs[0])
-
-
-@dataclass(frozen=True, kw_only=True)
 class Coin(CustomPolicy):
     """±γ/√m along each axis, by chance."""
 
@@ -75,31 +65,6 @@ class Coin(CustomPolicy):
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
         sides, m = [-system.gamma, system.gamma], system.n_inputs
         return Answer(lambda _: rng.choice(sides, size=m) / np.sqrt(m))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tampering(CustomPolicy):
-    """Writes into what was observed."""
-
-    name: ClassVar[str] = "tampering"
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return Answer(lambda view: np.negative(view.states[0, :1], out=view.states[0, :1]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Misasking(CustomPolicy):
-    """Asks for what follows, or for a Jacobian, with one axis too many."""
-
-    name: ClassVar[str] = "misasking"
-
-    of_inputs: int = 0
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        inputs = np.zeros((1, system.n_inputs + 1))
-        if self.of_inputs:
-            return Answer(lambda view: view.following(view.states[-1], inputs))
-        return Answer(lambda view: view.jacobian(view.states[-1:]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from dopt.reference.batch import run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, System
-from tests.dopt.custom_plugins import ANSWERS
+from tests.dopt.custom_plugins import ANSWERS, Answer
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 from tests.paths import EXAMPLE, ROOT, printed
@@ -39,6 +39,10 @@ def specification(system: str = "pendulum", seed: int = 0, /, **sections: Any) -
 
 def own(name: str, **fields: Any) -> dict[str, Any]:
     return {"_target_": f"{HERE}.{name}", **fields}
+
+
+def here(name: str, **fields: Any) -> dict[str, Any]:
+    return {"_target_": f"{__name__}.{name}", **fields}
 
 
 PATHS = pytest.mark.parametrize("path", ["kernel", "reference"])
@@ -109,6 +113,10 @@ GIVEN: dict[str, Any] = {
     "wide": np.ones((5, 4)),
     "far": np.full((5, 1), 1e3),
     "lost": np.full((5, 1), np.nan),
+    "lost later": Answer(lambda view: np.full(1, np.nan) if view.t >= 5 else 0.0 * view.inputs[0]),
+    "tampering": Answer(lambda view: np.negative(view.states[0, :1], out=view.states[0, :1])),
+    "an input": Answer(lambda view: view.following(view.states[-1], np.zeros((1, 2)))),
+    "an axis": Answer(lambda view: view.jacobian(view.states[-1:])),
 }
 
 
@@ -183,25 +191,27 @@ def test_what_own_parts_return_is_checked(part: str, what: str, sentence: str, p
 
 
 @pytest.mark.parametrize(
-    ("policy", "error", "sentence"),
+    ("too_many", "error", "sentence"),
     [
-        (own("Tampering"), ValueError, "read-only"),
-        (own("Misasking", of_inputs=1), SpecificationError, r"inputs of shape \(1, 2\), but \(N"),
-        (own("Misasking"), SpecificationError, r"a state of shape \(1, 2\), but \(2,\) is expec"),
+        ("tampering", ValueError, "read-only"),
+        ("an input", SpecificationError, r"inputs of shape \(1, 2\), but \(N"),
+        ("an axis", SpecificationError, r"a state of shape \(1, 2\), but \(2,\) is expec"),
     ],
 )
 def test_a_plan_in_the_kernel_neither_writes_nor_reads_where_it_may_not(
-    policy: Any, error: type[Exception], sentence: str
+    too_many: str, error: type[Exception], sentence: str
 ) -> None:
     """Compiled code would read beyond the end of an array."""
     with pytest.raises(error, match=sentence):
-        run_trial(specification(policy=policy))
+        run_trial(specification(policy=here("Bringing", what=too_many)))
 
 
 @PATHS
 def test_a_plan_that_gets_lost_with_its_model_ends_its_trial_alone(path: str) -> None:
     learner = {"name": "adam", "learning_rate": 1e40}
-    result = run_trial(specification(policy=own("Lost"), learner=learner), path)
+    result = run_trial(
+        specification(policy=here("Bringing", what="lost later"), learner=learner), path
+    )
     assert result.diverged_at == 5
     assert np.isfinite(result.loss[:5]).all()
     assert np.isnan(result.loss[5:]).all()
@@ -272,10 +282,6 @@ def on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         sys.modules.pop(name, None)
 
 
-def own_compiled(name: str, **fields: object) -> dict[str, object]:
-    return {"_target_": f"{__name__}.{name}", **fields}
-
-
 @pytest.mark.parametrize("env", ["pendulum", "arm"])
 @pytest.mark.parametrize(
     ("section", "target"), [("policy", "frontier.Frontier"), ("learner", "heavy_ball.HeavyBall")]
@@ -314,7 +320,7 @@ def test_copies_of_shipped_classes_give_their_very_numbers() -> None:
 
 
 def test_a_learner_keeps_its_memory_and_its_file_is_part_of_the_key() -> None:
-    spec = specification(learner=own_compiled("Counting"))
+    spec = specification(learner=here("Counting"))
     assert run_trial(spec).parameters[0] == 25.0
     section: Any = spec.to_mapping()["learner"]
     assert len(section["source"]) == 16
@@ -332,7 +338,7 @@ def test_what_a_compiled_function_may_not_do_is_one_sentence(
     section: str, name: str, more: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(SpecificationError, match=sentence) as caught:
-        run_trial(specification(**{section: own_compiled(name)}, **more))
+        run_trial(specification(**{section: here(name)}, **more))
     assert "\n" not in str(caught.value)
 
 

@@ -7,10 +7,8 @@ import gzip
 import hashlib
 import io
 import os
-import threading
 from collections.abc import Iterator
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +23,10 @@ from dopt.fitting.simulation import Data
 from studies.real import choice, data, plants, results
 from studies.real.__main__ import CASES, QUESTIONS, main, parts
 from studies.real.protocol import Fold, closed_loop, folds
-from tests.paths import ROOT
+from tests.paths import ROOT, served
 
 DATA = os.environ.get("DOPT_DATA")
 recorded = pytest.mark.skipif(DATA is None, reason="DOPT_DATA names no folder of recorded runs")
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
 
 
 @pytest.fixture
@@ -41,12 +34,8 @@ def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Serve ``tmp_path/host``, with a cache of downloads beside it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "host").mkdir()
-    with ThreadingHTTPServer(
-        ("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path / "host"))
-    ) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+    with served(tmp_path / "host") as address:
+        yield address
 
 
 def serve(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> data.Source:
