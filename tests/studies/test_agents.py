@@ -329,6 +329,23 @@ def test_global_generators_go_on_as_if_it_were_not_there() -> None:
     assert draws() == expected
 
 
+def test_two_agents_do_not_disturb_each_other() -> None:
+    alone, first, second = agent(), agent(), agent(5)
+    for one in (alone, first, second):
+        fed(one, 80)
+    expected = []
+    for _ in range(3):
+        alone.learn(2)
+        expected.append(alone.act(np.zeros((1, 2))))
+    found = []
+    for _ in range(3):
+        first.learn(2)
+        second.learn(1)
+        found.append(first.act(np.zeros((1, 2))))
+        second.act(np.zeros((1, 2)))
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_what_is_forgotten_is_not_learned_from() -> None:
     one = fed(agent(), 80)
     one.forget()
