@@ -12,6 +12,7 @@ from scipy.stats import kstest
 from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
+from dopt.kernel.run import KernelTrial
 from dopt.models import RFF, GaussianProcess
 from dopt.models.gaussian_process import kernel
 from dopt.offline_fit import fit_offline
@@ -20,8 +21,8 @@ from dopt.run import rerun, run_trial
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.kernel.twin import model_of_kernel
-from tests.dopt.oracles.traces import jacobian, observed, trace
+from tests.dopt.kernel.twin import check_inverse, model_of_kernel
+from tests.dopt.oracles.traces import jacobian, observed
 from tests.dopt.trials import trial, uniform_samples
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
@@ -66,21 +67,23 @@ def test_random_features_stay_and_differ_from_seed_to_seed() -> None:
 
 @pytest.mark.parametrize("policy", ["random_held", "d_optimal"])
 @pytest.mark.parametrize(("env", "model"), [("arm", "rff"), ("mass_spring", "linear_state")])
-def test_least_squares_minimise_the_ridge_loss(env: str, model: str, policy: str) -> None:
+def test_least_squares_minimise_the_ridge_loss_and_hold_its_matrix(
+    env: str, model: str, policy: str
+) -> None:
     """With the ridge of a policy that plans by the same matrix, or their own."""
     spec = regression(env, model, policy, learner={"regularization": 3e-2})
-    run = trace(spec)
-    states = run.states[:-1]
-    targets = observed(spec, run)
+    fast = KernelTrial(spec)
+    fast.advance(spec.system.horizon)
+    states, targets = fast.states[:-1], observed(spec, fast.record)
     q = spec.model.n_parameters(spec.system) - spec.model.n_fixed_parameters(spec.system)
-    drawn = draw(spec).weights
-    units = np.concatenate([np.eye(q), np.tile(drawn[q:], (q, 1))], axis=1)
+    units = np.concatenate([np.eye(q), np.tile(draw(spec).weights[q:], (q, 1))], axis=1)
     columns = [spec.model.predict(spec.system, unit, states).ravel() for unit in units]
-    ridge = 1e-2 if policy == "d_optimal" else 3e-2
-    design = np.concatenate([np.stack(columns, axis=1), np.sqrt(ridge) * np.eye(q)])
+    J, ridge = np.stack(columns, axis=1), 1e-2 if policy == "d_optimal" else 3e-2
+    check_inverse(fast, ridge * np.eye(q) + J.T @ J, 1e-8)
+    design = np.concatenate([J, np.sqrt(ridge) * np.eye(q)])
     aims = np.concatenate([targets.ravel(), np.zeros(q)])
     expected = np.linalg.lstsq(design, aims, rcond=None)[0]
-    found = run.parameters[-1][:q]
+    found = fast.parameters[:q]
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * np.abs(expected).max())
 
 
@@ -224,18 +227,20 @@ def small(
     return trial(env, policy, seed, **merged)
 
 
-@pytest.mark.parametrize("model", READERS)
+@pytest.mark.parametrize("model", [*READERS, "rff"])
 def test_values_and_rows_are_those_of_the_model(model: str) -> None:
-    spec = small("arm", model)
+    spec = small("arm", model, "d_optimal", LEARNERS.get(model, "adam_window"))
     rng = np.random.default_rng(1)
-    theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
+    theta, q = draw(spec).weights.copy(), len(KernelTrial(spec).state.theta)  # features stay
+    theta[:q] += 0.1 * rng.standard_normal(q)
     x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
-    values, points = spec.model.predict(spec.system, theta, x, u), np.hstack([x, u])
-    kernel = model_of_kernel(spec, theta)
+    points = np.hstack([x, u]) if model in READERS else x
+    values = spec.model.predict(spec.system, theta, x, u)
+    kernel = model_of_kernel(spec, theta[:q])
     assert kernel.predict(points) == pytest.approx(values, rel=1e-12)
     for point, J in zip(points, jacobian(spec, theta, points), strict=True):
         np.testing.assert_allclose(kernel.jacobian(point), J, rtol=1e-9, atol=1e-12)
-        along, step = rng.standard_normal((1, 6)), 1e-5
+        along, step = rng.standard_normal((1, points.shape[1])), 1e-5
         change = kernel.jacobian_change(point, along)[0]
         ends = jacobian(spec, theta, point + step * along * np.array([[1.0], [-1.0]]))
         np.testing.assert_allclose(change, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-8)
