@@ -31,15 +31,8 @@ LONGEST = 700
 """Lines above which a file is counted as long."""
 
 SKIPPED = {"vendor", "__pycache__"}
-NO_CODE = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENCODING,
-    tokenize.ENDMARKER,
-}
+NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
+NO_CODE |= {tokenize.ENCODING, tokenize.ENDMARKER}
 
 
 def files(folders: Iterable[str], *endings: str) -> list[Path]:
@@ -94,15 +87,8 @@ def walk() -> tuple[int, int, int, int, int]:
     from dopt.run import run_trial
     from dopt.spec.trial import TrialSpec
 
-    spec = TrialSpec.from_mapping(
-        {
-            "env": {"name": "cartpole", "horizon": 5, "grid_points": [3, 4, 3]},
-            "policy": {"name": "d_optimal"},
-            "model": {"name": "mlp"},
-            "learner": {"name": "adam_window"},
-            "seed": 0,
-        }
-    )
+    env = {"name": "cartpole", "horizon": 5, "grid_points": [3, 4, 3]}
+    spec = TrialSpec.from_names(env, "d_optimal")
     run_trial(spec)
     rooms, ran = set[str](), set[str]()
     calls: list[tuple[FrameType, bool]] = []

@@ -1,22 +1,21 @@
-"""Rules of the architecture, read from the imports and docstrings of the packages."""
+"""Rules of the architecture, read from imports and docstrings; tools of the tests."""
 
 from __future__ import annotations
 
 import ast
 import functools
-import itertools
-import json
 import re
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+import yaml
 
 from dopt.kernel.cache import COMPILED_SOURCES
-from tests.paths import ROOT, without_coverage
+from tests.measure_house import code_lines
+from tests.paths import CONF, EXAMPLE, ROOT, loaded_by
 
 PACKAGES = ("dopt", "orchestrate", "analysis")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
@@ -44,11 +43,7 @@ ONLY_IN = {
     "jinja2": ("analysis/serve/",),
 }
 
-NUMBERS = (
-    "analysis/data",
-    "analysis/stats",
-    "analysis/tables",
-)
+NUMBERS = ("analysis/data", "analysis/stats", "analysis/tables")
 """Parts of the analysis that compute or select numbers and draw nothing."""
 
 BASE = {"errors", "records", "files", "program"}
@@ -139,24 +134,9 @@ def importers(module: str) -> list[str]:
     ]
 
 
-def loaded_by(module: str) -> set[str]:
-    """Return the top-level modules that are loaded once ``module`` is, in a fresh process."""
-    return {name.split(".")[0] for name in all_loaded_by(module)}
-
-
-def all_loaded_by(module: str) -> list[str]:
-    """Return all modules that are loaded once ``module`` is, in a fresh process."""
-    program = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=ROOT,
-        env=without_coverage(),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    names: list[str] = json.loads(done.stdout)
-    return names
+def tops_loaded_by(program: str) -> set[str]:
+    """Return the top-level modules that are loaded once a program has run."""
+    return {name.split(".")[0] for name in loaded_by(program)}
 
 
 def test_the_science_knows_no_effects() -> None:
@@ -168,7 +148,7 @@ def test_the_science_knows_no_effects() -> None:
 
 def test_what_saves_an_exploration_is_loaded_by_the_first_save() -> None:
     assert imports(ROOT / "dopt/explorer/saving.py") >= SAVES
-    assert not loaded_by("dopt.explorer.saving") & (EFFECTS | {"orchestrate"})
+    assert not tops_loaded_by("import dopt.explorer.saving") & (EFFECTS | {"orchestrate"})
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
@@ -244,54 +224,73 @@ def test_every_part_of_orchestrate_has_its_place() -> None:
     assert not circle(arrows)
 
 
-def test_numbers_load_no_matplotlib() -> None:
-    paths = [ROOT / part for part in NUMBERS]
-    files = itertools.chain.from_iterable(
-        sorted(path.rglob("*.py")) if path.is_dir() else [path] for path in paths if path.exists()
-    )
-    modules = [module_name(path) for path in files]
+def test_numbers_load_neither_matplotlib_nor_what_runs_trials() -> None:
+    paths = (ROOT / part for part in NUMBERS)
+    modules = [module_name(path) for folder in paths for path in sorted(folder.rglob("*.py"))]
     assert len(modules) > 10
-    modules += ["analysis.tables.variants", "analysis.tables.rendering", "analysis.report"]
-    assert "matplotlib" not in loaded_by(", ".join([*modules, "analysis.outputs", "analysis.cli"]))
-
-
-def test_a_specification_loads_no_torch() -> None:
-    modules = ", ".join(module_name(path) for path in sources("dopt/spec"))
-    assert "torch" not in loaded_by(modules)
+    modules += ["analysis.report", "analysis.outputs", "analysis.cli"]
+    heavy = {"matplotlib", "torch", "ray", "hydra", "numba"}
+    assert not tops_loaded_by(f"import {', '.join(modules)}") & heavy
 
 
 def test_a_specification_loads_numpy_and_nothing_heavier() -> None:
-    always = loaded_by("sys")  # such as Debian's sitecustomize
-    third_party = loaded_by("dopt.spec.trial") - always - set(sys.stdlib_module_names)
+    always = tops_loaded_by("")  # such as Debian's sitecustomize
+    modules = ", ".join(module_name(path) for path in sources("dopt/spec"))
+    third_party = tops_loaded_by(f"import {modules}") - always - set(sys.stdlib_module_names)
     assert {name for name in third_party if not name.startswith("_")} <= {"dopt", "numpy"}
 
 
-def test_a_trial_in_the_kernel_needs_no_torch() -> None:
-    assert "torch" not in loaded_by("dopt.run, dopt.kernel.run")
-
-
-def test_the_read_side_loads_neither_torch_nor_ray_nor_hydra() -> None:
-    loaded = loaded_by("analysis.data.samples")
-    assert not loaded & {"torch", "ray", "hydra", "numba"}
-
-
 def test_the_store_loads_at_most_five_modules_of_the_science() -> None:
-    names = all_loaded_by("orchestrate.store")
+    names = loaded_by("import orchestrate.store")
     assert len([name for name in names if name.split(".")[0] == "dopt"]) <= 5
 
 
-def test_every_package_is_typed_and_described() -> None:
-    for package in PACKAGES:
-        for path in sources(package):
-            tree = ast.parse(path.read_text())
-            assert ast.get_docstring(tree) or not tree.body, f"{path} says nothing of itself"
-
-
 @pytest.mark.parametrize("package", PACKAGES)
-def test_a_module_docstring_begins_with_a_noun_phrase(package: str) -> None:
-    first_words = {
-        module_name(path): (ast.get_docstring(ast.parse(path.read_text())) or "").split(" ")[0]
-        for path in sources(package)
-    }
-    riddles = {name: word for name, word in first_words.items() if word in QUESTION_WORDS}
-    assert not riddles
+def test_every_module_says_what_it_is_by_a_noun_phrase(package: str) -> None:
+    for path in sources(package):
+        tree = ast.parse(path.read_text())
+        said = ast.get_docstring(tree) or ""
+        assert said or not tree.body, f"{path} says nothing of itself"
+        assert said.split(" ")[0] not in QUESTION_WORDS, path
+
+
+MODULE = '''"""Docstring
+of two lines."""
+
+import os
+from sys import (
+    path,
+)
+
+NAMES = (  # two lines, and a comment
+    "a")
+"""Text below a name."""
+
+
+def function():
+    """Docstring."""
+    # A comment.
+    text = """one
+two"""
+    return text
+'''
+
+
+def test_imports_comments_blank_lines_and_docstrings_are_no_code() -> None:
+    assert code_lines(MODULE) == 6
+
+
+def test_no_file_of_the_project_sets_the_mode_of_hydra() -> None:
+    folders = [CONF, EXAMPLE / "conf", ROOT / "tests" / "machines" / "conf"]
+    files = [path for folder in folders for path in sorted(folder.rglob("*.yaml"))]
+    assert len(files) > 50
+    for path in files:
+        settings = (yaml.safe_load(path.read_text()) or {}).get("hydra") or {}
+        assert "mode" not in settings, path
+
+
+@pytest.mark.xdist_group("alone")
+def test_a_group_is_known_to_the_scheduler(request: pytest.FixtureRequest) -> None:
+    """Where pytest and pytest-xdist do not fit, each worker starts what a group shares."""
+    grouped = getattr(request.config.option, "loadgroup", False)
+    assert request.node.nodeid.endswith("@alone") == grouped

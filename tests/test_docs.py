@@ -32,20 +32,16 @@ pytestmark = pytest.mark.xdist_group("docs")  # one database for all of them
 TUTORIAL = "docs/tutorial.md"
 STRUCTURE = "docs/structure.md"
 PLUGINS = "docs/compiled_plugins.md"
-SHARING = "docs/sharing.md"  # tests/test_sharing_page.py
+SHARING = "docs/sharing.md"  # tests/test_pages.py
 SHORT = {"env": {"horizon": 40}}
 TASK = {"task": {"name": "control", "checkpoints": [20]}}
 
+OTHERS = {"sh", "export", "docker", "mkdir", "git", "make", "set", "ray", "kubectl"}
 SHELL = {
     "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_explorer.py
     "docs/install.md": {".", "make"},
-    "docs/many_machines.md": {
-        *("sh", "export", "docker", "mkdir", "git", "make", "set", "ray", "kubectl"),
-        *(
-            "bash",
-            "sbatch",
-        ),  # docs/example: tests/orchestrate/test_launches.py, test_slurm_workers.py
-    },
+    # docs/example: tests/orchestrate/test_launches.py, test_slurm_workers.py
+    "docs/many_machines.md": {*OTHERS, "bash", "sbatch"},
     "README.md": {"make"},
 }
 """Programs that no test here runs, by page; those of three machines have tests of their own."""
@@ -59,12 +55,6 @@ def test_every_function_of_the_map_from_the_paper_exists() -> None:
     for path, name in places:
         module = importlib.import_module(path.removesuffix(".py").replace("/", "."))
         assert callable(attrgetter(name)(module)), f"{path}:{name}"
-
-
-def test_every_module_at_the_top_of_dopt_has_a_line() -> None:
-    tree = PAGES[STRUCTURE].split("\norchestrate/")[0]
-    modules = {path.name for path in (ROOT / "dopt").glob("*.py")} - {"__init__.py"}
-    assert set(re.findall(r"^  (\w+\.py) ", tree, flags=re.MULTILINE)) == modules
 
 
 # Which commands a reader types

@@ -1,22 +1,27 @@
-"""Pages for readers: their links, their tables, the README, and the page of the database."""
+"""Pages for readers: links, tables, the README, the pages of database and sharing, notebooks."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import re
+import shlex
 import shutil
 from pathlib import Path
 from types import ModuleType
 
+import matplotlib.pyplot as plt
+import nbformat
 import pytest
+from nbclient import NotebookClient
 
 from orchestrate.store import Reader
 from orchestrate.store.schema import SCHEMA_VERSION, VIEWS, metadata
 from tests.analysis.synthetic import fill, make_grid
 from tests.pages import GENERATED, PAGES, anchors, blocks, links
 from tests.paths import ROOT, loaded
-from tests.test_docs import SHORT, TASK
+from tests.test_docs import SHARING, SHORT, TASK
+from tests.typed_commands import empty_folder, run_typed
 
 MADE = {"docker/secrets"}
 """Paths that a command of a page writes."""
@@ -62,21 +67,14 @@ def test_every_table_stands_on_a_page() -> None:
     assert text.count("<!-- table: ") == text.count("<!-- end -->")
 
 
-@pytest.fixture
-def copied(tmp_path: Path) -> Path:
-    """Copy the pages and CSV files, with the README beside them."""
-    shutil.copy(ROOT / "README.md", tmp_path)
-    for path in (ROOT / "docs").rglob("*"):
-        if path.suffix in {".csv", ".md"}:
-            copy = tmp_path / "docs" / path.relative_to(ROOT / "docs")
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(path, copy)
-    return tmp_path / "docs"
-
-
 def test_a_changed_number_is_noticed_and_written(
-    copied: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """On a copy of the pages, with the README beside them."""
+    shutil.copy(ROOT / "README.md", tmp_path)
+    copied = tmp_path / "docs"
+    pictures = shutil.ignore_patterns("vendor", "*.png", "*.gif")
+    shutil.copytree(ROOT / "docs", copied, ignore=pictures)
     summary = copied / "summary.csv"
     first = summary.read_text().splitlines()[1].split(",")[3]
     summary.write_text(summary.read_text().replace(first, "7.5"))
@@ -107,18 +105,11 @@ def test_its_example_runs() -> None:
     assert output.getvalue().strip().endswith(f"{states} {inputs}")
 
 
-@pytest.mark.parametrize(
-    "part", ["docs/figure1.png", "make figures", "make test", "@inproceedings"]
-)
-def test_it_has_what_a_reader_looks_for(part: str) -> None:
-    assert part in README
-
-
-@pytest.mark.parametrize("paper", ["NeurIPS_ML4PS_2022_37", "2304.13426"])
-def test_it_cites_the_paper_and_its_successor(paper: str) -> None:
+def test_it_cites_the_paper_and_its_successor() -> None:
     (entries,) = blocks(README, "bibtex")
-    assert paper in entries
-    assert README.count(paper) >= 2  # linked in the text as well
+    for paper in ("NeurIPS_ML4PS_2022_37", "2304.13426"):
+        assert paper in entries
+        assert README.count(paper) >= 2  # linked in the text as well
 
 
 DATABASE = "docs/database.md"
@@ -207,3 +198,82 @@ def test_every_column_of_a_view_is_named(sqlite_url: str) -> None:
             (row,) = re.findall(rf"^\| `{view}` \| [^|]+ \| (.*) \|$", page, flags=re.MULTILINE)
             found = reader.query(f"SELECT * FROM {view}").columns
             assert list(found) == [*shared, *re.findall(r"`(\w+)`", row)], view
+
+
+def test_commands_and_programs_of_the_page_of_sharing_run_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty_folder(tmp_path, monkeypatch)
+    fill("sqlite:///results/results.db", make_grid(("pendulum",), seeds=range(3), **SHORT))
+    for block in blocks(PAGES[SHARING], "bash"):
+        for line in block.splitlines():
+            run_typed(shlex.join(shlex.split(line, comments=True)), monkeypatch, capsys)
+    for program in blocks(PAGES[SHARING], "python"):
+        exec(compile(program, SHARING, "exec"), {})
+        assert "pendulum" in capsys.readouterr().out
+    assert (tmp_path / "figures" / "all" / "figure1.pdf").is_file()
+
+
+NOTEBOOK, PLANT = (
+    nbformat.read(ROOT / "docs" / name, as_version=4) for name in ("explore.ipynb", "plant.ipynb")
+)
+
+
+@pytest.mark.parametrize(("notebook", "pictures"), [(NOTEBOOK, 3), (PLANT, 2)])
+def test_a_notebook_is_executed(notebook: nbformat.NotebookNode, pictures: int) -> None:
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    assert sum("image/png" in str(cell.outputs) for cell in cells) >= pictures
+
+
+def test_the_notebook_of_a_plant_runs_in_ten_cells_without_a_database(tmp_path: Path) -> None:
+    assert len(PLANT.cells) == 10
+    text = " ".join(cell.source for cell in PLANT.cells)
+    assert not re.search(r"\b(hydra|ray|sql)", text, re.IGNORECASE)
+    place = {"metadata": {"path": str(tmp_path)}}
+    done = NotebookClient(nbformat.from_dict(PLANT), resources=place).execute()
+    [error] = [cell.outputs[0] for cell in done.cells if "free_run_error" in cell.source]
+    assert float(error["data"]["text/plain"]) < 0.05
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the root of a repository whose database has two configurations of a policy.
+
+    The other configuration has as many trials.
+    """
+    url = f"sqlite:///{tmp_path}/results/results.db"
+    (tmp_path / "docs").mkdir()
+    for fields in ({"horizon": 40}, {"horizon": 40, "gamma": 3.0}):
+        systems = ("pendulum", "cartpole")
+        fill(url, make_grid(systems, ("d_optimal", "random"), range(6), env=fields))
+    monkeypatch.delenv("DOPT_DB", raising=False)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    return tmp_path
+
+
+def test_a_notebook_runs_in_docs(root: Path) -> None:
+    place = {"metadata": {"path": str(root / "docs")}}
+    client = NotebookClient(nbformat.from_dict(NOTEBOOK), resources=place)
+    client.execute()  # raises what a cell raises
+
+
+def test_cells_of_a_notebook_run_in_the_root(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root)
+    names: dict[str, object] = {}
+    for cell in NOTEBOOK.cells:
+        if cell.cell_type == "code":
+            exec(cell.source, names)
+    assert len(plt.get_fignums()) >= 1
+    plt.close("all")
+
+
+def test_a_policy_of_a_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    [defined] = [text for text in blocks(PAGES["docs/tutorial.md"], "python") if "Halves" in text]
+    asked = "spec.to_mapping()['policy']['_target_'], spec.trial_key"
+    cells = [nbformat.v4.new_code_cell(text) for text in (defined, asked)]
+    notebook = nbformat.v4.new_notebook(cells=cells)
+    place = {"metadata": {"path": str(tmp_path)}}
+    done = NotebookClient(notebook, resources=place).execute()
+    assert "'__main__.Alternating'" in done.cells[1].outputs[0]["data"]["text/plain"]

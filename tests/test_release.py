@@ -22,6 +22,8 @@ METADATA = PROJECT["project"]
 WRITTEN = (".ipynb", ".md", ".py", ".sh", ".yaml", ".html")
 """Endings of the files in which people and machines read commands."""
 
+FOLDERS = ("analysis", "benchmarks", "conf", "docker", "docs", "dopt", "orchestrate", "studies")
+
 UNTESTED = {"torch"}
 """Libraries whose lower bound is not tested; constraints-lowest.txt says why."""
 
@@ -93,16 +95,7 @@ def test_no_command_for_pip_names_the_project_that_has_the_name_of_the_import() 
     by_pip = r"(pip|uv)[^\n]* (install|add|download)[^\n]*[ '\"]dopt\b(?!-)"
     foreign = re.compile(rf"\bdopt\[[a-z]|{by_pip}")
     files = [path for path in (*ROOT.glob("*"), ROOT / "docker/Dockerfile") if path.is_file()]
-    for folder in (
-        "analysis",
-        "benchmarks",
-        "conf",
-        "docker",
-        "docs",
-        "dopt",
-        "orchestrate",
-        "studies",
-    ):
+    for folder in FOLDERS:
         files += [path for path in (ROOT / folder).rglob("*") if path.suffix in WRITTEN]
     assert len(files) > 300
     assert not [path for path in files if foreign.search(path.read_text(errors="replace"))]

@@ -7,16 +7,12 @@ import inspect
 import re
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
 import dopt
-from tests.paths import EXAMPLE, ROOT
+from tests.paths import EXAMPLE, ROOT, served
 
 pytestmark = pytest.mark.xdist_group("site")  # one site for all of them
 
@@ -96,25 +92,15 @@ def test_no_page_asks_another_host(site: Path) -> None:
     assert not [path for path in files if LOADED.search(path.read_text())]
 
 
-class _Silent(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None: ...
-
-
-@pytest.fixture
-def address(site: Path) -> Iterator[str]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Silent, directory=str(site))) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
-
-
 @pytest.mark.browser
-def test_formulas_are_set_in_their_fonts_and_nothing_else_is_asked_for(address: str) -> None:
+def test_formulas_are_set_in_their_fonts_and_nothing_else_is_asked_for(site: Path) -> None:
     from tests.analysis.browser import chromium
 
-    with chromium.opened() as browser, chromium.strict_page(browser, address) as page:
+    with (
+        served(site) as address,
+        chromium.opened() as browser,
+        chromium.strict_page(browser, address) as page,
+    ):
         page.goto("/method.html")
         page.wait_for_selector(".katex")
         ready = (

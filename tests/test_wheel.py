@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.dopt.test_custom_classes import TYPED
 from tests.paths import ROOT
 
 SOURCES = ("dopt", "orchestrate", "analysis", "conf")
@@ -110,34 +111,11 @@ def test_an_installed_program_explains_itself(programs: Path, crowded: Path, pro
     assert wrong.stderr.startswith("error: ")
 
 
-HELD = """
-from dataclasses import dataclass
-from typing import ClassVar
-
-import numpy as np
-
-from dopt.policies.base import CustomPolicy, Planner
-
-
-class Plan(Planner):
-    def choose(self, view):
-        return np.array([1.0])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Held(CustomPolicy):
-    name: ClassVar[str] = "held"
-
-    def planner(self, system, rng):
-        return Plan()
-"""
-
-
 @pytest.mark.parametrize("executor", ["local", "ray"])
 def test_the_workers_of_an_installed_launch_import_our_packages(
     programs: Path, crowded: Path, executor: str
 ) -> None:
-    (crowded / "first/held.py").write_text(HELD)
+    (crowded / "first/held.py").write_text(TYPED)
     (crowded / "conf/policy").mkdir(parents=True)
     (crowded / "conf/policy/held.yaml").write_text("_target_: held.Held\n")
     words = ("--config-dir", "conf", "-m", "env=pendulum", "env.horizon=5", "policy=held")

@@ -7,22 +7,22 @@ import math
 import sqlite3
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks import bit_equality, cli, history, kernel
+from benchmarks import bit_equality, cli, gpu, history, kernel
 from benchmarks.cli import HEADERS, QUESTIONS, main, parser
 from benchmarks.history import FEWEST, Run, append, costs, read, slower
 from benchmarks.processes import _accounts
-from benchmarks.rows import Anchor, Row, Target, Timing, algebra, fixed_seconds, interpreter
+from benchmarks.rows import Anchor, Row, Target, Timing
 from benchmarks.trials import CYCLE, cost, step_us
 from dopt.result import TrialResult
-from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.paths import ROOT
 
@@ -92,14 +92,11 @@ def test_ratios_are_above_one_where_the_target_is_met() -> None:
     assert at_most.ratio(0.0) == math.inf
 
 
-def test_a_row_shows_how_many_times_faster_it_is_than_others() -> None:
+def test_a_row_shows_how_many_times_faster_it_is_than_others_or_why_it_was_left_out() -> None:
     row = Row("step", 100.0, "µs", Target(1, 125.0), Anchor(12_600.0, "others"), "note")
     assert row.cells() == ["100 µs", "1: ≤ 125", "1.25", "12,600", "126", "note"]
-
-
-def test_what_was_left_out_says_why() -> None:
-    assert Row("scan", None, note="jax is not installed").cells()[0] == "left out"
-    assert Row("scan", None, note="jax is not installed").cells()[-1] == "jax is not installed"
+    first, *_, last = Row("scan", None, note="jax is not installed").cells()
+    assert (first, last) == ("left out", "jax is not installed")
 
 
 def test_the_rate_of_a_launch_leaves_out_the_first_trial_of_each_worker() -> None:
@@ -143,11 +140,20 @@ def test_a_line_that_is_no_run_is_named(past: Path) -> None:
         read(past)
 
 
-@pytest.mark.parametrize(("value", "slow"), [(119.0, False), (121.0, True), (50.0, False)])
+@pytest.mark.parametrize(
+    ("value", "unit_seconds", "slow"),
+    [
+        (119.0, 0.01, False),
+        (121.0, 0.01, True),
+        (50.0, 0.01, False),
+        (200.0, 0.02, False),  # of a machine that is slow in all
+        (100.0, 0.005, True),
+    ],
+)
 def test_a_row_is_slower_at_a_fifth_more_than_the_median(
-    past: Path, value: float, slow: bool
+    past: Path, value: float, unit_seconds: float, slow: bool
 ) -> None:
-    assert bool(slower(read(past), run(value))) is slow
+    assert bool(slower(read(past), run(value, unit_seconds))) is slow
 
 
 def test_a_rate_is_slower_when_it_falls() -> None:
@@ -157,13 +163,9 @@ def test_a_rate_is_slower_when_it_falls() -> None:
     assert str(found) == "step: D-optimal: 2.00 times the median of 3 runs"
 
 
-def test_a_slow_machine_is_not_a_slow_row(past: Path) -> None:
-    assert not slower(read(past), run(200.0, unit_seconds=0.02))
-    assert slower(read(past), run(100.0, unit_seconds=0.005))
-
-
 def test_a_run_is_compared_with_those_on_its_kind_of_processor(past: Path) -> None:
     runs = read(past)
+    assert not slower(runs[:2], run(1000.0)), "two runs are no median"
     assert not slower(runs, run(170.0, processor="other"))
     (found,) = slower(runs, run(210.0, processor="other"))
     assert str(found) == "step: D-optimal: 2.10 times the median of 3 runs on all processors"
@@ -171,10 +173,6 @@ def test_a_run_is_compared_with_those_on_its_kind_of_processor(past: Path) -> No
     assert not slower(runs, run(200.0, processor="other"))
     assert slower(runs, run(210.0, processor="other"))
     assert slower(runs, run(121.0))
-
-
-def test_two_runs_are_no_median(past: Path) -> None:
-    assert not slower(read(past)[:2], run(1000.0))
 
 
 def test_what_is_no_time_is_left_out() -> None:
@@ -238,25 +236,13 @@ def test_a_slower_step_is_found_beside_other_processes(busy: float, slowdown: fl
     assert found.times == pytest.approx(slowdown, rel=0.05)
 
 
-def test_a_slower_kernel_is_found_where_it_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_row_of_a_step_is_what_its_trials_took_to_plan_and_learn(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def half_as_long_again(spec: TrialSpec) -> TrialResult:
-        result = run_trial(spec)
-        return replace(result, plan_us=1.5 * result.plan_us, learn_us=1.5 * result.learn_us)
-
-    past, new = tmp_path / "past.jsonl", tmp_path / "new.jsonl"
-    for _ in range(FEWEST):
-        assert main(["--quick", "--only", "step", "--history", str(past)]) == 0
-    monkeypatch.setattr(kernel, "run_trial", half_as_long_again)
-    command = ["--quick", "--only", "step", "--history", str(new), "--against", str(past)]
-    assert main(command) == 1
-    assert "slower: step: D-optimal, window of 100: 1." in capsys.readouterr().out
-
-
-def test_the_calibration_takes_time() -> None:
-    for work in (algebra, interpreter):
-        assert fixed_seconds(work) > 0.0
+    taken = SimpleNamespace(plan_us=np.full(500, 100.0), learn_us=np.full(500, 50.0))
+    monkeypatch.setattr(kernel, "run_trial", lambda _: taken)
+    rows = kernel.step(quick=True)[:4]
+    assert [row.value for row in rows] == pytest.approx([150.0] * 4)
 
 
 def test_the_stored_history_holds_enough_runs_of_what_is_checked() -> None:
@@ -312,3 +298,54 @@ def test_a_difference_is_named(
 def test_two_databases_are_expected(capsys: pytest.CaptureFixture[str]) -> None:
     assert bit_equality.main(["nowhere.db"]) == 2
     assert "two SQLite databases are expected" in capsys.readouterr().out
+
+
+# The benchmark of batches on a GPU, on the CPU with small ones
+
+
+def test_the_cpu_stands_in_for_a_card(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(gpu, "SIZES", {"cpu": (2, 3)})
+    monkeypatch.setattr(gpu, "COMPARED", 8)
+    monkeypatch.setattr(gpu, "speed", _full_at(3))
+    assert gpu.main(["--device", "cpu"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("largest difference of an input: ") == 2
+    assert "2 trials on cpu: " in out
+    assert "% of the memory's rate" in out
+    assert "3 trials on cpu: left out (the memory of the device is too small)" in out
+    assert gpu.main(["--device", "cpu", "--seconds", "0"]) == 0
+    assert "2 trials on cpu: left out (the time was over" in capsys.readouterr().out
+
+
+def _full_at(size: int) -> Callable[..., Row]:
+    measured = gpu.speed
+
+    def speed(what: str, device: str, trials: int, steps: int, rate: float) -> Row:
+        if trials == size:
+            raise torch.OutOfMemoryError
+        return measured(what, device, trials, steps, rate)
+
+    return speed
+
+
+def test_a_device_that_is_not_there_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gpu.main(["--device", "cuda:99"]) == 1
+    assert "--device is 'cuda:99', but torch runs here on cpu" in capsys.readouterr().err
+
+
+def test_an_input_of_another_sign_counts_unless_rounding_decides(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spec = TrialSpec.from_names(env="cartpole", policy="d_optimal", seed=0)
+    one = np.ones((1, 6, 1))
+    other = one.copy()
+    other[0, 4:] = -1.0
+    assert gpu.cosine(spec, 4) > gpu.TIE
+    assert gpu.largest_difference([spec], one, other) == (2.0, "")
+    monkeypatch.setattr(gpu, "TIE", 1.1)
+    assert gpu.largest_difference([spec], one, other) == (0.0, ", a tie at step 4 of seed 0")
+    monkeypatch.undo()
+    other[0, 2] = np.nan
+    assert gpu.largest_difference([spec], one, other)[0] == np.inf

@@ -127,11 +127,11 @@ PIECE = 7
 
 
 class Whole(PointEnv):
-    """Takes whole numbers, in single precision or not."""
+    """Takes whole numbers, or those of another type."""
 
-    def __init__(self, kind: Any = np.int64, low: float = -2, high: float = 2) -> None:
+    def __init__(self, dtype: Any = np.int64) -> None:
         super().__init__(wall=1e9)
-        self.action_space = Box(low, high, (1,), kind)
+        self.action_space = Box(-2, 2, (1,), dtype)
         self.taken: list[Any] = []
         TAKEN.append(self.taken)
 
@@ -273,6 +273,7 @@ for kind in (Whole, Truncating, Restarting, OneSided, OneBuffer):
     register(kind)
 register(Restarting, "Single", after=1)
 register(Restarting, "Near", spread=2.0)
+register(Whole, "Double", dtype=np.float64)
 
 SEEN: list[Any] = []
 """Accelerations that :class:`Noting` was taught last, (T, r)."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dopt.models import Model
-from dopt.reference.models import BatchModel, model_function
+from dopt.reference.models import model_function
 from dopt.systems.base import System
 
 
@@ -51,15 +51,7 @@ class Broken(Stack):
         raise RuntimeError(f"no way from {features.shape[-1]} features")
 
 
-def for_one(model: BatchModel) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a_θ: parameters (q,) and a point, (d,) or (d + m,), to accelerations (r,)."""
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        return model(theta[None], x[None, None])[0, 0]
-
-    return accelerations
-
-
 def model_of_one(system: System, model: Model) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a_θ of a registered model, for one trial and one point."""
-    return for_one(model_function(system, model))
+    """Return a_θ of a model: parameters (q,), a point, (d,) or (d + m,), to accelerations (r,)."""
+    function = model_function(system, model)
+    return lambda theta, x: function(theta[None], x[None, None])[0, 0]

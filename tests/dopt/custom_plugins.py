@@ -1,13 +1,15 @@
-"""Users' policies and learners, written in numpy: copies of shipped ones, and bad ones."""
+"""Users' policies and learners in numpy: copies of shipped ones, bad ones, and compiled twins."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
+from dopt.kernel.compiler import StoredCode, compiled, content_digest
+from dopt.kernel.structs import Trial
 from dopt.learning.base import CustomLearner, Updater
 from dopt.policies.base import Array, CustomPolicy, Planner
 from dopt.systems import System
@@ -55,33 +57,6 @@ class Answer(Planner):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wild(CustomPolicy):
-    """Chooses what it may not: ``scale`` times γ, in ``size`` inputs."""
-
-    name: ClassVar[str] = "wild"
-
-    scale: float = 2.0
-    size: int = 1
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return self.late(np.full(self.size, system.gamma * self.scale))
-
-    def late(self, inputs: Array) -> Planner:
-        """Return a plan that chooses an input of the right size from step 5 on."""
-        return Answer(lambda view: inputs if view.t >= 5 or self.size > 1 else 0.0 * view.inputs[0])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lost(Wild):
-    """Gets lost."""
-
-    name: ClassVar[str] = "lost"
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return self.late(np.array([np.nan]))
-
-
-@dataclass(frozen=True, kw_only=True)
 class Coin(CustomPolicy):
     """±γ/√m along each axis, by chance."""
 
@@ -90,31 +65,6 @@ class Coin(CustomPolicy):
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
         sides, m = [-system.gamma, system.gamma], system.n_inputs
         return Answer(lambda _: rng.choice(sides, size=m) / np.sqrt(m))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tampering(CustomPolicy):
-    """Writes into what was observed."""
-
-    name: ClassVar[str] = "tampering"
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return Answer(lambda view: np.negative(view.states[0, :1], out=view.states[0, :1]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Misasking(CustomPolicy):
-    """Asks for what follows, or for a Jacobian, with one axis too many."""
-
-    name: ClassVar[str] = "misasking"
-
-    of_inputs: int = 0
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        inputs = np.zeros((1, system.n_inputs + 1))
-        if self.of_inputs:
-            return Answer(lambda view: view.following(view.states[-1], inputs))
-        return Answer(lambda view: view.jacobian(view.states[-1:]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,27 +107,17 @@ def asked(view: TrialView) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Descent(CustomLearner):
-    """Adam on the newest sample, as printed in Algorithm 1; ``extra`` parameters are a mistake."""
+    """Adam on the newest sample, as printed in Algorithm 1."""
 
     name: ClassVar[str] = "descent"
 
-    extra: int = 0
-
     def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
-        return DescentUpdater(self.extra)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaughtInTorch(Descent):
-    """Says that it is written in torch."""
-
-    name: ClassVar[str] = "taught_in_torch"
-    compiled: ClassVar[bool] = False
+        return DescentUpdater()
 
 
 class DescentUpdater(Updater):
-    def __init__(self, extra: int) -> None:
-        self._first, self._second, self._extra = np.zeros(1), np.zeros(1), extra
+    def __init__(self) -> None:
+        self._first, self._second = np.zeros(1), np.zeros(1)
 
     def update(self, view: TrialView) -> Array:
         x, y = view.states[-2], view.accelerations[-1]
@@ -185,5 +125,73 @@ class DescentUpdater(Updater):
         self._first = 0.9 * self._first + 0.1 * gradient
         self._second = 0.999 * self._second + 0.001 * gradient**2
         scale = np.sqrt(self._second / (1 - 0.999**view.t)) + 1e-8
-        theta = view.parameters - 2e-3 * self._first / (1 - 0.9**view.t) / scale
-        return np.concatenate([theta, np.zeros(self._extra)])
+        theta: Array = view.parameters - 2e-3 * self._first / (1 - 0.9**view.t) / scale
+        return theta
+
+
+# A policy and a learner as this package would gain them: class, kernel function, no other code
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def kept(function: F) -> F:
+    """Compile a function as the package does, and store its machine code as for a user's.
+
+    The cache keeps functions of the package and of users' classes; here it would be
+    compiled in every process, for seconds.
+    """
+    dispatcher = compiled(function)
+    folder = f"own/{content_digest(function)}"
+    dispatcher._cache = StoredCode(function, folder)  # type: ignore[attr-defined]
+    return dispatcher
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alternating(CustomPolicy):
+    """A share of γ along the first axis, with a sign that changes at every step."""
+
+    name: ClassVar[str] = "alternating"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "tests.dopt.custom_plugins.plan_alternating"
+
+    share: float = 0.5
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        u = self.share * system.gamma * np.eye(system.n_inputs)[0]
+        return Answer(lambda view: u if view.t % 2 == 0 else -u)
+
+
+@kept
+def plan_alternating(trial: Trial, t: int, u: Array) -> None:
+    size = trial.algorithm.policy[0] * trial.plant.gamma
+    u[:] = 0.0
+    u[0] = size if t % 2 == 0 else -size
+
+
+@dataclass(frozen=True, kw_only=True)
+class Average(CustomLearner):
+    """Every parameter follows the first observed acceleration."""
+
+    name: ClassVar[str] = "average"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "tests.dopt.custom_plugins.learn_average"
+
+    share: float = 0.1
+
+    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
+        return AverageUpdater(self.share)
+
+
+class AverageUpdater(Updater):
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def update(self, view: TrialView) -> Array:
+        return view.parameters + self._share * (view.accelerations[-1, 0] - view.parameters)
+
+
+@kept
+def learn_average(trial: Trial, t: int, target: Array) -> None:  # noqa: ARG001  # the signature of all
+    theta = trial.state.theta
+    for i in range(len(theta)):
+        theta[i] += trial.algorithm.learner[0] * (target[0] - theta[i])

@@ -45,15 +45,7 @@ def with_task(spec: TrialSpec, task: dict[str, object]) -> TrialSpec:
 
 
 def test_the_key_of_a_trial_without_a_task_is_what_it_was() -> None:
-    paper = TrialSpec.from_mapping(
-        {
-            "env": {"name": "pendulum"},
-            "policy": {"name": "d_optimal"},
-            "model": {"name": "mlp"},
-            "learner": {"name": "adam_window"},
-            "seed": 3,
-        }
-    )
+    paper = TrialSpec.from_names("pendulum", "d_optimal", seed=3)
     assert "task" not in json.loads(paper.canonical_json())
     assert paper.trial_key == KEY
     for nothing in ({}, {"task": None}, {"task": {"name": "none"}}):
@@ -319,13 +311,10 @@ class Steady(TaskPolicy):
     reads_inputs: ClassVar[bool] = True
 
     def task_planner(self, system: System, goal: Goal, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        return SteadyPlan(goal)
+        return SteadyPlan()
 
 
 class SteadyPlan(Planner):
-    def __init__(self, goal: Goal) -> None:
-        self.goal = goal
-
     def choose(self, view: TrialView) -> Array:
         return np.zeros(view.system.n_inputs)
 

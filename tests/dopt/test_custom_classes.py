@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import linecache
-import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,12 +20,11 @@ from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.policies.base import ClosedLoop, CompiledPolicy, CustomPolicy, Planner
+from dopt.policies.base import ClosedLoop, CustomPolicy, Planner
 from dopt.registry import check_importable, source_digest
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec, stored_trial, system_of
 from dopt.systems import SYSTEMS, System
-from tests.dopt.trials import trial
 from tests.paths import EXAMPLE
 
 
@@ -142,17 +139,13 @@ HERE = __name__
         ("env", "Boat", {}, r"env\._target_.* cannot be imported"),
         ("env", "vehicle.np", {}, r"env\._target_.* a dataclass derived from dopt's System"),
         ("env", "vehicle.Staircase", {}, r"env\._target_.* derived from dopt's System"),
-        (
-            "env",
-            "dopt.systems.base.System",
-            {},
-            r"env\._target_.* defines accelerations, known",
-        ),
+        ("env", "dopt.systems.base.System", {}, r"env\._target_.* defines accelerations, known"),
         ("env", "vehicle.Boat", {"name": "ship"}, "is called 'boat'"),
         ("env", "vehicle.Boat", {"mas": 3.0}, r"env\.boat field"),
         ("policy", f"{HERE}.Nameless", {}, "a class with a 'name' of its own"),
         ("policy", f"{HERE}.Thief", {}, "a class with a 'name' of its own"),
         ("policy", f"{HERE}.Closed", {}, "derive it from OpenLoop or CustomPolicy"),
+        ("policy", "tests.dopt.custom_plugins.InTorch", {}, r"numpy, .* from CompiledPolicy\.$"),
         ("policy", "__main__.Nowhere", {}, r"policy is of the class .*into a file"),
     ],
 )
@@ -432,34 +425,3 @@ def test_how_lines_end_makes_no_other_trial(folder: Path, change: tuple[str, str
     assert after.config_key == before.config_key
     del sys.modules["stored_d"]
     assert stored_trial(json.loads(before.config_json)).config_key == before.config_key
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Chirping(CompiledPolicy):
-    name: ClassVar[str] = "chirping"
-
-    frequency: float | None = None
-    label: str | None = None
-    share: float = 0.5
-
-    @staticmethod
-    def plan(trial: Any, t: int, u: Any) -> None:
-        """Do nothing."""
-
-
-def test_a_number_keeps_its_place_where_one_before_it_is_not_given() -> None:
-    frequency, share = Chirping().kernel_numbers(1, 1.0)
-    assert math.isnan(frequency)
-    assert share == 0.5
-    assert Chirping(frequency=2.0, label="slow").kernel_numbers(1, 1.0) == (2.0, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("model", "path"),
-    [({"name": "mlp"}, "kernel"), ({"_target_": "tests.dopt.custom_networks.Stack"}, "reference")],
-)
-def test_a_trial_without_a_path_is_on_the_one_that_knows_its_parts(
-    model: dict[str, Any], path: str
-) -> None:
-    mapping = trial("pendulum", "d_optimal", 0).to_mapping() | {"model": model}
-    assert TrialSpec.from_mapping({**mapping, "path": None}).config.path == path

@@ -18,6 +18,8 @@ from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
+from tests.dopt.explorer.plants import following
+from tests.dopt.explorer.test_measurements import ENCODER, JOINT
 from tests.dopt.trials import trial
 
 RAIL: dict[str, Any] = {"bounds": {"y": [-2.0, 2.0]}}
@@ -78,9 +80,9 @@ def test_an_explorer_fed_the_states_of_a_trial_chooses_its_inputs() -> None:
     spec = limited("cartpole", TIGHT)
     result = run_trial(spec)
     explorer = Explorer(spec.system, limits=TIGHT)
-    for x, following, u in zip(result.states, result.states[1:], result.inputs, strict=False):
+    for x, after, u in zip(result.states, result.states[1:], result.inputs, strict=False):
         assert explorer.ask(x) == pytest.approx(u, abs=1e-12)
-        explorer.tell(following)
+        explorer.tell(after)
 
 
 def test_rates_are_counted_from_the_last_answer() -> None:
@@ -301,3 +303,52 @@ def test_it_learns_from_the_angle_alone() -> None:
     )
     assert joint.loss[-1] < 0.5 * differences.loss[-1]
     assert joint.loss[-1] < 0.5 * random.loss[-1]
+
+
+def test_a_matrix_that_selects_states_measures_them() -> None:
+    rows = {"output_matrix": [0, 0, 1, 0, 1, 0, 0, 0], "measurement_noise": [DEGREE, 0.01]}
+    selected, given = (
+        run_trial(sensed("cartpole", sensors, horizon=20)) for sensors in (CART, rows)
+    )
+    assert np.array_equal(selected.inputs, given.inputs)
+    assert np.array_equal(selected.parameters, given.parameters)
+    changed = ABSOLUTE | {"output_matrix": [1, 0, 0, 0, 1, 0, 2, 0]}
+    specs = [sensed("arm", sensors) for sensors in (JOINTS, ABSOLUTE, changed)]
+    assert len({spec.config_key for spec in specs}) == 3
+
+
+def test_a_mixture_of_states_needs_a_learner_that_estimates_them() -> None:
+    mixed = {"output_matrix": [1, 0.1], "measurement_noise": [0.1]}
+    with pytest.raises(IncompatibleError, match=r"output_matrix goes with .* 'joint_ekf'"):
+        sensed("pendulum", mixed, "adam")
+    with pytest.raises(SpecificationError, match="an explorer is told states"):
+        Explorer(sensed("pendulum", mixed).system, learner="joint_ekf")
+
+
+def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
+    """Also while its rate is unknown at first; ``violations`` count the estimates."""
+    places, counts = [], []
+    for enforced in (True, False):
+        limits = {"bounds": {"angle": [-1.0, 1.0]}, "steps": 15, "enforced": enforced}
+        explorer = Explorer(ENCODER, steps=150, limits=limits, **JOINT)
+        rng, x = np.random.default_rng(0), np.array([0.1, 0.0])
+        y, visited = x[:1], []
+        for _ in range(150):
+            x = following(x, explorer.ask(y))
+            y = x[:1] + DEGREE * rng.standard_normal(1)
+            explorer.tell(y)
+            visited.append(abs(x[0]))
+        places.append(max(visited))
+        rows = {row.measure: row.value for row in explorer._result(None).assessments}
+        counts.append(rows["violations"])
+        assert counts[-1] == np.count_nonzero(np.abs(explorer.states[1:, 0]) > 1.0)
+    assert places[0] <= 1.0 < places[1]
+    assert counts[0] == 0.0 < counts[1]
+
+
+def test_limits_of_filtered_differences_are_refused() -> None:
+    """Nothing says how uncertain these are; limits that are counted alone need no such thing."""
+    mapping = sensed("cartpole", CART, "adam_window").to_mapping()
+    TrialSpec.from_mapping(mapping | {"limits": RAIL | {"enforced": False}})
+    with pytest.raises(IncompatibleError, match="which knows how uncertain its estimates are"):
+        TrialSpec.from_mapping(mapping | {"limits": RAIL})

@@ -1,4 +1,4 @@
-"""Models linear in their parameters, grey boxes, ensembles, input models, outputs."""
+"""Models linear in their parameters, grey boxes, ensembles, and models that read inputs."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ from scipy.stats import kstest
 from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.explorer import Explorer
+from dopt.kernel.run import KernelTrial
 from dopt.models import RFF, GaussianProcess
 from dopt.models.gaussian_process import kernel
-from dopt.offline_fit import fit_offline, grid_loss
+from dopt.offline_fit import fit_offline
 from dopt.randomness import PLANNED_DIMENSIONS, draw
 from dopt.run import rerun, run_trial
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.kernel.twin import model_of_kernel
-from tests.dopt.oracles.traces import jacobian, observed, trace
-from tests.dopt.test_limits import ABSOLUTE, CART, DEGREE, JOINTS, sensed
+from tests.dopt.kernel.twin import check_inverse, model_of_kernel
+from tests.dopt.oracles.traces import jacobian, observed
 from tests.dopt.trials import trial, uniform_samples
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
@@ -68,21 +67,23 @@ def test_random_features_stay_and_differ_from_seed_to_seed() -> None:
 
 @pytest.mark.parametrize("policy", ["random_held", "d_optimal"])
 @pytest.mark.parametrize(("env", "model"), [("arm", "rff"), ("mass_spring", "linear_state")])
-def test_least_squares_minimise_the_ridge_loss(env: str, model: str, policy: str) -> None:
+def test_least_squares_minimise_the_ridge_loss_and_hold_its_matrix(
+    env: str, model: str, policy: str
+) -> None:
     """With the ridge of a policy that plans by the same matrix, or their own."""
     spec = regression(env, model, policy, learner={"regularization": 3e-2})
-    run = trace(spec)
-    states = run.states[:-1]
-    targets = np.array([observed(spec, run, t) for t in range(len(states))])
+    fast = KernelTrial(spec)
+    fast.advance(spec.system.horizon)
+    states, targets = fast.states[:-1], observed(spec, fast.record)
     q = spec.model.n_parameters(spec.system) - spec.model.n_fixed_parameters(spec.system)
-    drawn = draw(spec).weights
-    units = np.concatenate([np.eye(q), np.tile(drawn[q:], (q, 1))], axis=1)
+    units = np.concatenate([np.eye(q), np.tile(draw(spec).weights[q:], (q, 1))], axis=1)
     columns = [spec.model.predict(spec.system, unit, states).ravel() for unit in units]
-    ridge = 1e-2 if policy == "d_optimal" else 3e-2
-    design = np.concatenate([np.stack(columns, axis=1), np.sqrt(ridge) * np.eye(q)])
+    J, ridge = np.stack(columns, axis=1), 1e-2 if policy == "d_optimal" else 3e-2
+    check_inverse(fast, ridge * np.eye(q) + J.T @ J, 1e-8)
+    design = np.concatenate([J, np.sqrt(ridge) * np.eye(q)])
     aims = np.concatenate([targets.ravel(), np.zeros(q)])
     expected = np.linalg.lstsq(design, aims, rcond=None)[0]
-    found = run.parameters[-1][:q]
+    found = fast.parameters[:q]
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * np.abs(expected).max())
 
 
@@ -185,16 +186,12 @@ def test_it_explores_as_its_first_member_does_alone(policy: str) -> None:
     assert not np.allclose(found.loss, alone.loss)
 
 
-def test_the_loss_is_that_of_the_mean_prediction() -> None:
+def test_the_prediction_is_the_mean_of_the_members() -> None:
     spec = make(ENSEMBLE)
-    result = run_trial(spec)
-    assert result.loss[-1] == pytest.approx(grid_loss(spec, result.parameters), rel=1e-5)
-    states = evaluation_set(spec.system).states[:5]
-    members = [
-        make({"name": "mlp"}).model.predict(spec.system, theta, states)
-        for theta in members_of(result.parameters)
-    ]
-    found = spec.model.predict(spec.system, result.parameters, states)
+    theta, states = draw(spec).weights, evaluation_set(spec.system).states[:5]
+    alone = make({"name": "mlp"}).model
+    members = [alone.predict(spec.system, one, states) for one in members_of(theta)]
+    found = spec.model.predict(spec.system, theta, states)
     np.testing.assert_allclose(found, np.mean(members, axis=0), rtol=1e-12)
 
 
@@ -202,11 +199,6 @@ def test_the_loss_is_that_of_the_mean_prediction() -> None:
     ("learner", "words"),
     [
         ({"name": "adam_window"}, "and model 'ensemble' with learner 'gauss_newton', but the two"),
-        (
-            {"name": "ekf"},
-            "goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' and model "
-            "'ensemble' with",
-        ),
         ({"name": "gauss_newton", "refit_every": 2}, "but learner.refit_every 2 was given"),
     ],
 )
@@ -235,18 +227,20 @@ def small(
     return trial(env, policy, seed, **merged)
 
 
-@pytest.mark.parametrize("model", READERS)
+@pytest.mark.parametrize("model", [*READERS, "rff"])
 def test_values_and_rows_are_those_of_the_model(model: str) -> None:
-    spec = small("arm", model)
+    spec = small("arm", model, "d_optimal", LEARNERS.get(model, "adam_window"))
     rng = np.random.default_rng(1)
-    theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
+    theta, q = draw(spec).weights.copy(), len(KernelTrial(spec).state.theta)  # features stay
+    theta[:q] += 0.1 * rng.standard_normal(q)
     x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
-    values, points = spec.model.predict(spec.system, theta, x, u), np.hstack([x, u])
-    kernel = model_of_kernel(spec, theta)
+    points = np.hstack([x, u]) if model in READERS else x
+    values = spec.model.predict(spec.system, theta, x, u)
+    kernel = model_of_kernel(spec, theta[:q])
     assert kernel.predict(points) == pytest.approx(values, rel=1e-12)
     for point, J in zip(points, jacobian(spec, theta, points), strict=True):
         np.testing.assert_allclose(kernel.jacobian(point), J, rtol=1e-9, atol=1e-12)
-        along, step = rng.standard_normal((1, 6)), 1e-5
+        along, step = rng.standard_normal((1, points.shape[1])), 1e-5
         change = kernel.jacobian_change(point, along)[0]
         ends = jacobian(spec, theta, point + step * along * np.array([[1.0], [-1.0]]))
         np.testing.assert_allclose(change, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-8)
@@ -288,21 +282,6 @@ def test_the_oracle_learns_the_gain(name: str) -> None:
     assert result.parameters[-1] == pytest.approx(1.3, rel=0.02)
 
 
-@pytest.mark.parametrize("model", READERS)
-def test_the_loss_is_the_error_over_states_and_inputs(model: str) -> None:
-    spec = small("cartpole_unknown_gain", model)
-    result, points = run_trial(spec), evaluation_set(spec.system)
-    assert np.abs(points.inputs[: points.n_grid]).max() <= spec.system.gamma
-    truth = spec.system.learned(points.states, inputs=points.inputs)
-    errors = truth - spec.model.predict(
-        spec.system, result.parameters, points.states, points.inputs
-    )
-    squares = np.sum(errors**2, axis=1)
-    assert result.loss[-1] == pytest.approx(np.sqrt(squares[: points.n_grid].mean()), rel=1e-5)
-    reachable = np.sqrt(squares[points.n_grid :].mean())
-    assert result.reachable_loss[-1] == pytest.approx(reachable, rel=1e-5)
-
-
 def test_samples_of_states_and_inputs_are_fitted_offline() -> None:
     spec = small("pendulum_unknown_gain", env={"horizon": 300, "grid_points": [8, 8]})
     samples = uniform_samples(spec)
@@ -327,6 +306,8 @@ def test_inputs_fill_the_ball_where_their_effect_is_not_affine(env: str) -> None
     for radii, dimensions in zip(drawn.radii.T, (PLANNED_DIMENSIONS * m, m), strict=True):
         assert kstest(radii**dimensions, "uniform").pvalue > 0.01
     assert abs(np.corrcoef(drawn.radii.T)[0, 1]) < 0.2
+    inputs = evaluation_set(spec.system).inputs
+    assert np.linalg.norm(inputs, axis=1).max() <= gamma * (1 + 1e-12)
     uniform = np.linalg.norm(uniform_samples(spec).inputs, axis=1) / gamma
     assert kstest(uniform**m, "uniform").pvalue > 0.01
 
@@ -354,23 +335,3 @@ def test_what_reads_no_inputs_is_refused() -> None:
     with pytest.raises(IncompatibleError, match="'auto', which takes 'dual' here"):
         small("arm", "affine", model={"width": 64}, env={"horizon": 500})
     small("arm", "black_box", policy={"form": "dual"})
-
-
-def test_a_matrix_that_selects_states_measures_them() -> None:
-    rows = {"output_matrix": [0, 0, 1, 0, 1, 0, 0, 0], "measurement_noise": [DEGREE, 0.01]}
-    selected, given = (
-        run_trial(sensed("cartpole", sensors, horizon=20)) for sensors in (CART, rows)
-    )
-    assert np.array_equal(selected.inputs, given.inputs)
-    assert np.array_equal(selected.parameters, given.parameters)
-    changed = ABSOLUTE | {"output_matrix": [1, 0, 0, 0, 1, 0, 2, 0]}
-    specs = [sensed("arm", sensors) for sensors in (JOINTS, ABSOLUTE, changed)]
-    assert len({spec.config_key for spec in specs}) == 3
-
-
-def test_what_estimates_no_states_is_refused() -> None:
-    mixed = {"output_matrix": [1, 0.1], "measurement_noise": [0.1]}
-    with pytest.raises(IncompatibleError, match=r"output_matrix goes with .* 'joint_ekf'"):
-        sensed("pendulum", mixed, "adam")
-    with pytest.raises(SpecificationError, match="an explorer is told states"):
-        Explorer(sensed("pendulum", mixed).system, learner="joint_ekf")

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from dopt import Explorer
 from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
 from dopt.assessment import loss_by_parameter_error, parameter_error, true_parameters
-from dopt.errors import IncompatibleError, SpecificationError
+from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, random_transitions
 from dopt.kernel import joint_kalman
 from dopt.kernel.linear_algebra import dense
@@ -34,13 +33,11 @@ from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, CoupledPendulums
 from dopt.types import Array
-from tests.dopt.explorer.plants import following
-from tests.dopt.explorer.test_measurements import ENCODER, JOINT
-from tests.dopt.kernel.twin import interpreted, observed
+from tests.dopt.kernel.twin import interpreted
 from tests.dopt.oracles.test_oracles import filtered
 from tests.dopt.oracles.traces import jacobian as complex_jacobian
-from tests.dopt.oracles.traces import model_step
-from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, sensed
+from tests.dopt.oracles.traces import model_step, observed
+from tests.dopt.test_limits import ANGLE, DEGREE, sensed
 from tests.dopt.trials import trial, uniform_samples
 
 SMALL = {"width": 4, "depth": 2}
@@ -127,7 +124,7 @@ def test_recorded_samples_are_what_the_learner_was_given(env: str) -> None:
     running = KernelTrial(spec)
     running.advance(spec.system.horizon)
     samples = recorded_samples(spec.system, running.record.states, running.record.inputs)
-    given = observed(running, running.done)
+    given = observed(spec, running.record)
     np.testing.assert_allclose(samples.accelerations, given, rtol=5e-10, atol=5e-10)
     assert np.array_equal(samples.states, rerun(spec, [spec.system.horizon]).states[:-1])
 
@@ -184,35 +181,6 @@ def test_variances_are_those_of_state_and_parameters_in_one_filter() -> None:
     expected = filtered(fast.spec, fast.state.estimate.outputs[:12], fast.record.inputs[:12])[2]
     found = interpreted(joint_kalman.state_variances)(fast.trial, 12)
     np.testing.assert_allclose(found, expected[:2], rtol=1e-3)
-
-
-def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
-    """Also while its rate is unknown at first; ``violations`` count the estimates."""
-    places, counts = [], []
-    for enforced in (True, False):
-        limits = {"bounds": {"angle": [-1.0, 1.0]}, "steps": 15, "enforced": enforced}
-        explorer = Explorer(ENCODER, steps=150, limits=limits, **JOINT)
-        rng, x = np.random.default_rng(0), np.array([0.1, 0.0])
-        y, visited = x[:1], []
-        for _ in range(150):
-            x = following(x, explorer.ask(y))
-            y = x[:1] + DEGREE * rng.standard_normal(1)
-            explorer.tell(y)
-            visited.append(abs(x[0]))
-        places.append(max(visited))
-        rows = {row.measure: row.value for row in explorer._result(None).assessments}
-        counts.append(rows["violations"])
-        assert counts[-1] == np.count_nonzero(np.abs(explorer.states[1:, 0]) > 1.0)
-    assert places[0] <= 1.0 < places[1]
-    assert counts[0] == 0.0 < counts[1]
-
-
-def test_limits_of_filtered_differences_are_refused() -> None:
-    """Nothing says how uncertain these are; limits that are counted alone need no such thing."""
-    mapping = sensed("cartpole", CART, "adam_window").to_mapping()
-    TrialSpec.from_mapping(mapping | {"limits": RAIL | {"enforced": False}})
-    with pytest.raises(IncompatibleError, match="which knows how uncertain its estimates are"):
-        TrialSpec.from_mapping(mapping | {"limits": RAIL})
 
 
 def test_the_loss_of_coupled_pendulums_is_their_parameter_error_times_a_constant() -> None:

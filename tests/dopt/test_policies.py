@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +16,7 @@ from dopt.policies.base import OpenLoop
 from dopt.policies.held_candidates import DisagreementPlan, SpaceFilling, SpaceFillingPlan
 from dopt.randomness import draw
 from dopt.run import run_trial
-from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS, System
+from dopt.systems import SYSTEMS
 from dopt.systems.properties import eigenmode
 from dopt.trial_view import Array, TrialView
 from tests.dopt.trials import ALL_PAIRS, covering, trial
@@ -52,25 +49,22 @@ def test_inputs_obey_the_bound(env: str, policy: str) -> None:
         assert norms == pytest.approx(spec.system.gamma, rel=1e-12)
 
 
-@pytest.mark.parametrize("env", ["pendulum", "arm"])
-def test_gaussian_inputs_have_the_energy_of_the_bound_on_average(env: str) -> None:
-    u = open_loop(env, "random", 40_000)
+@pytest.mark.parametrize(
+    ("policy", "env"), [("random", "pendulum"), ("random", "arm"), ("random_sphere", "arm")]
+)
+def test_white_inputs_have_the_energy_of_the_bound_and_no_memory(policy: str, env: str) -> None:
+    u = open_loop(env, policy, 40_000)
     m = u.shape[1]
     assert (u**2).sum(axis=1).mean() == pytest.approx(9.0, rel=0.03)
-    assert np.atleast_2d(np.cov(u.T)) == pytest.approx(9.0 / m * np.eye(m), abs=0.03 * 9.0)
-    kurtosis = (u**4).mean(axis=0) / (u**2).mean(axis=0) ** 2
-    assert kurtosis == pytest.approx(3.0, rel=0.1)
-
-
-@pytest.mark.parametrize("policy", ["random", "random_sphere"])
-def test_white_inputs_are_independent_from_step_to_step(policy: str) -> None:
-    u = open_loop("arm", policy, 10_000)
-    assert abs((u[1:] * u[:-1]).sum(axis=1).mean()) < 0.05 * 9.0
     assert u.mean(axis=0) == pytest.approx(0.0, abs=0.1)
-    assert np.cov(u.T) == pytest.approx(4.5 * np.eye(2), abs=0.2)
+    assert np.atleast_2d(np.cov(u.T)) == pytest.approx(9.0 / m * np.eye(m), abs=0.2)
+    assert abs((u[1:] * u[:-1]).sum(axis=1).mean()) < 0.05 * 9.0
+    if policy == "random":  # they are Gaussian
+        kurtosis = (u**4).mean(axis=0) / (u**2).mean(axis=0) ** 2
+        assert kurtosis == pytest.approx(3.0, rel=0.1)
 
 
-@pytest.mark.parametrize("hold", [1, 3, 10, 64, 500])
+@pytest.mark.parametrize("hold", [1, 10, 500])
 @pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
 def test_held_inputs_change_at_each_span_and_only_there(env: str, hold: int) -> None:
     u = open_loop(env, "random_held", 64, hold=hold)
@@ -118,14 +112,7 @@ def test_the_square_wave_has_the_signs_of_the_sine_and_twice_its_energy(env: str
 
 @pytest.mark.parametrize(
     ("policy", "env", "share"),
-    [
-        ("multisine", "pendulum", 1 / 3),
-        ("multisine", "arm", 1 / 3),
-        ("chirp", "pendulum", 0.5),
-        ("chirp", "arm", 1.0),
-        ("prbs", "arm", 1.0),
-        ("random_held", "arm", 1.0),
-    ],
+    [("multisine", "pendulum", 1 / 3), ("multisine", "arm", 1 / 3), ("chirp", "pendulum", 0.5)],
 )
 def test_the_mean_square_of_inputs_is_the_stated_share(policy: str, env: str, share: float) -> None:
     energies = [
@@ -140,39 +127,6 @@ def test_no_two_inputs_of_a_short_binary_sequence_are_the_same(seed: int) -> Non
     spec = trial("chain", "prbs", seed, env={"horizon": 30, "n_links": 5}, policy={"hold": 10})
     columns = np.unique(draw(spec).inputs, axis=1)
     assert columns.shape == (30, 5)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wrong(OpenLoop):
-    """Returns what it is told to return."""
-
-    name: ClassVar[str] = "wrong"
-    shape: tuple[int, ...] = ()
-    value: float = 1.0
-
-    def inputs(self, system: System, rng: np.random.Generator) -> Any:  # noqa: ARG002  # the same
-        return np.full(self.shape, np.nan if self.value < 0 else self.value)
-
-
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-@pytest.mark.parametrize(
-    ("shape", "value", "sentence"),
-    [
-        ((3, 3), 1.0, r"of shape \(3, 3\) .* of shape \(30, 1\) are expected: correct its"),
-        ((30,), 1.0, r"of shape \(30,\) .* of shape \(30, 1\) are expected"),
-        ((30, 4), 1.0, r"of shape \(30, 4\) .* of shape \(30, 1\) are expected"),
-        ((30, 1), 1e3, r"an input of norm 1000, but env\.gamma is 2: scale it down"),
-        ((30, 1), -1.0, r"an input of norm nan, but env\.gamma is 2"),
-    ],
-)
-def test_wrong_inputs_of_ones_own_are_refused(
-    path: str, shape: tuple[int, ...], value: float, sentence: str
-) -> None:
-    config = trial("pendulum", "random", env={"gamma": 2.0}).config
-    policy = Wrong(shape=shape, value=value)
-    spec = TrialSpec(dataclasses.replace(config, policy=policy, path=path), 0)
-    with pytest.raises(SpecificationError, match=sentence):
-        run_trial(spec)
 
 
 @pytest.mark.parametrize("env", ["pendulum", "arm"])

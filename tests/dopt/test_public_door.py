@@ -1,51 +1,41 @@
-"""Public names and what they load, sentences of errors, usable cores, systems without locks."""
+"""Public names and what they load, unknown names, given paths, usable cores, missing modules."""
 
 from __future__ import annotations
 
 import ast
 import importlib.metadata
-import json
+import logging
 import os
+import pwd
 import pydoc
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import dopt
 from analysis.outputs import versions
 from dopt import process
-from dopt.errors import unknown_name
+from dopt.errors import SpecificationError, _say_once, given_path, unknown_name
 from orchestrate.runner.saving import launch_record
-from tests.paths import ROOT
+from tests.dopt.explorer.plants import MOTOR
+from tests.paths import ROOT, loaded_by, printed
 
 HEAVY = {"torch", "ray", "numba", "hydra", "sqlalchemy", "matplotlib", "pandas", "scipy"}
-
-
-def loaded_by(program: str) -> set[str]:
-    """Return the top-level modules that a program loads in a fresh process."""
-    shown = f"{program}\nimport json, sys; print(json.dumps(sorted(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", shown], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return {name.split(".")[0] for name in json.loads(done.stdout)}
 
 
 def test_the_import_loads_no_library_and_a_specification_numpy_alone() -> None:
     program = "import sys, dopt; assert not {'numpy', 'scipy', 'numba'} & sys.modules.keys(); "
     program += "dopt.TrialSpec.from_names('pendulum', 'd_optimal'); dopt.TrialResult"
-    assert not loaded_by(program) & HEAVY
+    assert not {name.split(".")[0] for name in loaded_by(program)} & HEAVY
 
 
-@pytest.mark.parametrize("name", dopt.__all__)
-def test_every_public_name_is_there(name: str) -> None:
-    assert name in dir(dopt)
-    assert getattr(dopt, name) is getattr(dopt, name)
-    with pytest.raises(AttributeError, match=f"has no attribute '{name}l'"):
-        getattr(dopt, f"{name}l")
+def test_every_public_name_is_there() -> None:
+    for name in dopt.__all__:
+        assert name in dir(dopt)
+        assert getattr(dopt, name) is getattr(dopt, name)
+        with pytest.raises(AttributeError, match=f"has no attribute '{name}l'"):
+            getattr(dopt, f"{name}l")
 
 
 def test_the_version_is_that_of_the_code_and_not_of_another_project(
@@ -82,19 +72,6 @@ def test_a_type_checker_sees_the_names_where_they_are() -> None:
     assert set(dopt.__all__) == {*seen, "__version__"}
 
 
-def test_a_trial_runs_from_the_names_alone() -> None:
-    env = {"name": "pendulum", "horizon": 20}
-    spec = dopt.TrialSpec.from_names(env, "d_optimal")
-    result = dopt.run_trial(spec)
-    assert len({result, dopt.run_trial(spec)}) == 2, "results compare by identity"
-    assert isinstance(result, dopt.TrialResult)
-    assert result.states.shape == (21, 2)
-    error = spec.model.predict(spec.system, result.parameters, spec.system.grid())
-    error -= spec.system.learned(spec.system.grid())
-    rms = np.sqrt(np.mean(np.sum(error**2, axis=1)))
-    assert result.final_loss == pytest.approx(rms, rel=1e-4)
-
-
 NAMES = ("random", "d_optimal", "first/random_held", "first/prbs", "second/exact", "second/max")
 
 
@@ -102,13 +79,11 @@ NAMES = ("random", "d_optimal", "first/random_held", "first/prbs", "second/exact
     ("given", "nearest"),
     [
         ("d_optimla", "d_optimal"),
-        ("second/exatc", "second/exact"),
         ("secnd/exact", "second/exact"),
         ("first/exact", "second/exact"),
         ("second/random", "random"),
-        ("random_held", "first/random_held"),
-        ("random_hold", "first/random_held"),
         ("prbs", "first/prbs"),
+        ("random_hold", "first/random_held"),
         ("mxa", "second/max"),
     ],
 )
@@ -127,6 +102,76 @@ def test_no_name_is_suggested_where_none_is_near(given: object) -> None:
     nothing = str(unknown_name("field", "form", ()))
     assert nothing.endswith("is unknown, no field exists: remove it.")
 
+
+# Paths that users give, as one function reads them
+
+PLAIN = ["r.db", "/a/b c.db", "price$", "a$-b", "./~x", "%7E/x", "./ x", "é", "a~b", "\udcff.db"]
+REFUSED = ["", " \n", "$HOME/r.db", "/data/$USER/r.db", "${HOME}/x", "$(pwd)/x", "~nobody-here/x"]
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    _say_once.cache_clear()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "home"
+
+
+@pytest.mark.usefixtures("home")
+def test_a_path_stays_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
+    assert [given_path(given, "--out") for given in PLAIN] == [*map(Path, PLAIN)]
+    assert not caplog.records
+
+
+@pytest.mark.usefixtures("home")
+def test_what_is_around_a_path_is_left_out_with_one_note(caplog: pytest.LogCaptureFixture) -> None:
+    for around in ("{} ", " {}", "{}\n", "{}\r\n", "\t{} \n", "{}\N{NO-BREAK SPACE}"):
+        assert given_path(around.format("x/r.db"), "DOPT_CACHE") == Path("x/r.db")
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert record.message == "DOPT_CACHE: the blanks or line ends around it are left out"
+
+
+def test_a_tilde_is_the_home_folder(home: Path) -> None:
+    assert given_path("~", "--out") == home
+    assert given_path("~/x/r.db", "--out") == home / "x/r.db"
+    assert given_path("~root/r.db", "--out") == Path(pwd.getpwnam("root").pw_dir, "r.db")
+
+
+CODE = r"--out holds the control character '\\\w+'"
+
+
+@pytest.mark.usefixtures("home")
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        *((given, r"--out is '.*give") for given in REFUSED),
+        *((given, CODE) for given in ("a\nb", "a\0b", "a\x1b[2Jb", "a\x9bb")),
+    ],
+)
+def test_what_a_shell_expands_and_control_characters_are_refused(given: str, sentence: str) -> None:
+    with pytest.raises(SpecificationError, match=sentence):
+        given_path(given, "--out")
+
+
+@pytest.mark.usefixtures("home")
+def test_a_folder_that_is_named_like_a_variable_is_found(tmp_path: Path) -> None:
+    (tmp_path / "$HOME").mkdir()
+    (tmp_path / "a${b}c").mkdir()
+    assert given_path("$HOME/r.db", "--out") == Path("$HOME/r.db")
+    assert given_path(f"{tmp_path}/a${{b}}c/r.db", "--out") == tmp_path / "a${b}c/r.db"
+    with pytest.raises(SpecificationError, match=r"\$X is expanded by a shell"):
+        given_path("$HOME/$X/r.db", "--out")
+
+
+def test_a_journal(home: Path) -> None:
+    dopt.Explorer(MOTOR, journal="~/runs/one.jsonl\n").close()
+    assert [path.name for path in (home / "runs").iterdir()] == ["one.jsonl"]
+    with pytest.raises(SpecificationError, match=r"journal is '\$HOME/one.jsonl'"):
+        dopt.Explorer(MOTOR, journal="$HOME/one.jsonl")
+
+
+# Cores that a process may use
 
 Group = Callable[..., None]
 
@@ -194,7 +239,6 @@ def test_a_container_sees_its_own_group_as_the_top(group: Group) -> None:
 
 
 def test_nothing_else_counts_cores() -> None:
-
     counting = ("cpu_count", "sched_getaffinity(0))")
     found = [
         str(path.relative_to(ROOT))
@@ -232,7 +276,4 @@ print("done")
 
 
 def test_log_fit_and_explorer_run(tmp_path: Path) -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=tmp_path, capture_output=True, text=True, timeout=300
-    )
-    assert run.stdout.strip() == "done", run.stderr
+    assert printed(PROGRAM, folder=tmp_path, PYTHONPATH=str(ROOT)) == "done\n"

@@ -71,7 +71,7 @@ def with_value(spec: TrialSpec, section: str, field: str, value: Any) -> TrialSp
 
 
 def test_every_trial_comes_back_from_its_mapping_and_its_json() -> None:
-    for env, policy in ALL_PAIRS:
+    for env, policy in covering(ALL_PAIRS):
         spec = trial(env, policy, 7)
         again = TrialSpec.from_mapping(json.loads(json.dumps(spec.to_mapping())))
         assert again == spec
@@ -169,14 +169,11 @@ def test_any_numbers_come_back(
     [
         *(
             ({"seed": seed}, "^seed is .* whole number of 0 or above")
-            for seed in (-1, 1.0, True, "3", None, 0.5)
+            for seed in (-1, 1.0, True, "3", None)
         ),
         ({"polcy": {}}, r"'polcy' is unknown.*did you mean 'policy'\?"),
-        *(
-            ({section: given_value}, rf"'{section}' is .* a section")
-            for section in SECTIONS
-            for given_value in (None, "pendulum", 3)
-        ),
+        *(({section: "pendulum"}, rf"'{section}' is .* a section") for section in SECTIONS),
+        *(({"env": wrong}, "'env' is .* a section") for wrong in (None, 3)),
         (
             {"path": None, "model": {"name": "rff"}, "learner": {"name": "ekf"}},
             "^learner 'ekf' goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' "
@@ -229,6 +226,7 @@ PLAIN = config("pendulum", "d_optimal")
 BOUND = config("pendulum", "d_optimal", env={"gamma": 3})
 REPLAY = config("pendulum", "d_optimal", learner={"name": "adam_replay", "steps": 60})
 WIDE = config("pendulum", "d_optimal", model={"width": 64})
+FRESH = config("pendulum", "d_optimal", policy={"information": "fresh"})
 ORACLE = config("pendulum", "oracle")
 RANDOM = config("pendulum", "random")
 TASK = config("pendulum", "random", task={"name": "control"})
@@ -252,6 +250,7 @@ def boat(mass: float) -> Config:
         (BOUND, "D-optimal, γ=3"),
         (REPLAY, "D-optimal, adam_replay ×60"),
         (WIDE, "D-optimal, width 64"),
+        (FRESH, "D-optimal, information=fresh"),
         (ORACLE, "oracle"),
         (TASK, "random, task control"),
         (ENFORCED, "D-optimal, limits, φ=[-2, 2]"),
@@ -270,7 +269,8 @@ def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) ->
         ([BOUND], ["D-optimal"]),
         ([PLAIN, BOUND], ["D-optimal", "γ=3"]),
         ([PLAIN, REPLAY], ["D-optimal", "adam_replay ×60"]),
-        ([PLAIN, RANDOM], ["D-optimal", "random"]),
+        ([PLAIN, FRESH], ["D-optimal", "information=fresh"]),
+        ([completed(PLAIN), FRESH], ["D-optimal", "information=fresh"]),
         ([PLAIN, RANDOM, BOUND], ["D-optimal", "random", "D-optimal, γ=3"]),
         ([RANDOM, TASK], ["random", "task control"]),
         ([PLAIN, ENFORCED], ["D-optimal", "limits, φ=[-2, 2]"]),

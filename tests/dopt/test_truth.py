@@ -16,7 +16,6 @@ from dopt.control.planning import forecast_by, forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, simulate
 from dopt.models import MLP, RFF, Ensemble, Linear
-from dopt.models.base import Model
 from dopt.randomness import _STREAMS, draw, stream
 from dopt.reference.batch import run_trials
 from dopt.result import TrialResult
@@ -60,24 +59,38 @@ def test_the_observed_path_is_that_of_the_changing_system(path: Any) -> None:
     assert simulate(spec.system, result.inputs[:, None])[:, 0] == pytest.approx(result.states)
 
 
-FEATURES = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+RFF_LEAST_SQUARES = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+ENSEMBLE = {"model": {"name": "ensemble", "members": 4}, "learner": {"name": "gauss_newton"}}
+DRIFTING = {"env": DRIFT | {"grid_points": (20, 20)}}
 
 
 @pytest.mark.parametrize(
-    ("policy", "parts"),
-    [("random", {}), ("oracle", {}), ("gaussian_process", {}), ("random", FEATURES)],
+    ("env", "policy", "parts"),
+    [
+        ("drifting_pendulum", "random", DRIFTING),
+        ("drifting_pendulum", "oracle", DRIFTING),
+        ("drifting_pendulum", "gaussian_process", DRIFTING),
+        ("drifting_pendulum", "random", DRIFTING | RFF_LEAST_SQUARES),
+        ("arm", "d_optimal", ENSEMBLE),
+        ("cartpole_unknown_gain", "d_optimal", {"model": {"name": "affine"}}),
+        ("cartpole_unknown_gain", "d_optimal", {"model": {"name": "black_box"}}),
+    ],
 )
-def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(policy: str, parts: Any) -> None:
-    spec = trial("drifting_pendulum", policy, env=DRIFT | {"grid_points": (20, 20)}, **parts)
+def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(
+    env: str, policy: str, parts: Any
+) -> None:
+    """Over the grid and over the reachable states, with inputs where the model reads them."""
+    spec = trial(env, policy, **parts)
+    system, points = spec.system, evaluation_set(spec.system)
     seen, result = rerun(spec, range(1, 31)), run_trial(spec)
-    points = evaluation_set(spec.system)
+    n, at = points.n_grid, system.points(points.states, points.inputs)
     for t, theta in enumerate(seen.parameters):
-        errors = spec.model.predict(spec.system, theta, points.states)
-        errors = errors - spec.system.learned(points.states, t)
+        errors = spec.model.predict_at(system, theta, at)
+        errors = errors - system.learned(points.states, t, points.inputs)
         squares = np.sum(errors**2, axis=1)
-        loss, reachable = np.sqrt(squares[:400].mean()), np.sqrt(squares[400:].mean())
-        assert result.loss[t] == pytest.approx(loss, rel=1e-5)
-        assert result.reachable_loss[t] == pytest.approx(reachable, rel=1e-5)
+        losses = result.loss[t], result.reachable_loss[t]
+        expected = np.sqrt(squares[:n].mean()), np.sqrt(squares[n:].mean())
+        assert losses == pytest.approx(expected, rel=1e-5)
 
 
 def test_without_a_drift_it_is_the_pendulum() -> None:
@@ -199,7 +212,8 @@ def test_a_state_beyond_the_limit_from_the_start_leaves_no_row() -> None:
 
 
 def test_the_properties_of_a_whole_trial() -> None:
-    result = run_trial(trial("pendulum", "random"))
+    result, again = (run_trial(trial("pendulum", "random")) for _ in range(2))
+    assert len({result, again}) == 2, "results compare by identity"
     assert (result.diverged, result.diverged_at, result.n_steps) == (False, None, 30)
     assert result.final_loss == result.loss[-1]
     assert result.best_loss == result.loss.min()
@@ -325,14 +339,10 @@ def test_every_model_is_rolled_as_its_predictions_say(name: str) -> None:
         parameters = np.random.default_rng(1).standard_normal(model.n_parameters(system))
         if isinstance(model, Linear):  # drags brake, and are small enough for the Euler map
             parameters = 0.01 * np.abs(parameters)
-        predicted = functools.partial(predict, model, system, parameters)
-        expected = forecast_by(system, predicted)(*asked(system))
+        predict = functools.partial(model.predict, system, parameters)
+        expected = forecast_by(system, predict)(*asked(system))
         found = model_forecast(system, model, parameters)(*asked(system))
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def predict(model: Model, system: System, theta: np.ndarray, x: np.ndarray, u: np.ndarray) -> Any:
-    return model.predict(system, theta, x, u)
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))

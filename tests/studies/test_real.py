@@ -1,4 +1,4 @@
-"""Recorded runs of real plants: where they come from, how they are simulated, what is printed."""
+"""Recorded runs of real plants: their files, simulations and tables, and the choice of segments."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import gzip
 import hashlib
 import io
 import os
-import threading
 from collections.abc import Iterator
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -18,20 +16,17 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
+import dopt
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model
 from dopt.fitting.simulation import Data
-from studies.real import data, plants, results
+from studies.real import choice, data, plants, results
 from studies.real.__main__ import CASES, QUESTIONS, main, parts
 from studies.real.protocol import Fold, closed_loop, folds
+from tests.paths import ROOT, served
 
 DATA = os.environ.get("DOPT_DATA")
 recorded = pytest.mark.skipif(DATA is None, reason="DOPT_DATA names no folder of recorded runs")
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
 
 
 @pytest.fixture
@@ -39,12 +34,8 @@ def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Serve ``tmp_path/host``, with a cache of downloads beside it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "host").mkdir()
-    with ThreadingHTTPServer(
-        ("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path / "host"))
-    ) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+    with served(tmp_path / "host") as address:
+        yield address
 
 
 def serve(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> data.Source:
@@ -228,3 +219,41 @@ def test_a_short_run_of_the_disk_predicts_what_follows() -> None:
     (found,) = folds(case, given, test, 2, lambda _: None)
     assert len(found.ours) == 2000 - 51
     assert np.sqrt(np.mean(found.ours**2)) < 0.06
+
+
+def test_the_page_has_the_table_of_the_stored_segments() -> None:
+    rows = pd.read_csv(choice.STORED)
+    assert rows.groupby("parameters").seed.nunique().to_dict() == {6: 20, 47: 20}
+    page = (ROOT / "studies/real/README.md").read_text()
+    assert choice.table(rows).markdown().strip() in page
+
+
+def test_the_first_segment_at_which_an_error_is_reached_counts() -> None:
+    assert choice.reached(np.array([0.3, 0.1, 0.2, 0.05]), 0.1) == 2
+    assert choice.reached(np.array([0.3, np.inf]), 0.1) == 3, "never: one more than all"
+
+
+def test_a_ratio_is_paired() -> None:
+    """Seeds of other difficulty: each halves the number, whatever it is."""
+    rows = [
+        {"seed": s, "parameters": 6, "segments": n, "all": 1.0}
+        | {by: 1.0 if n >= at else 2.0 for by, at in (("chosen", 3 * s), ("random", 6 * s))}
+        for s in (1, 2, 4)
+        for n in range(1, 31)
+    ]
+    line = choice.table(pd.DataFrame(rows)).rows[0]
+    assert line[2:] == ["6", "12", "0.500 [0.500, 0.500]", "3, 0, 0"]
+
+
+@recorded
+def test_a_short_choice_of_segments_begins_as_the_random_one_and_gets_better() -> None:
+    assert DATA
+    blocks = parts("disk", Path(DATA)).values()
+    logs = [dopt.Log.for_plant(part, choice.PLANT, CASES["disk"].columns) for part in blocks]
+    found = choice.curves(logs, 1, 0, pool=12, most=5)
+    assert found.segments.to_list() == [1, 2, 3, 4, 5]
+    assert (found.parameters == 6).all()
+    first, last = found.iloc[0], found.iloc[-1]
+    assert first.chosen == first.random
+    assert last.chosen < 0.06
+    assert last["all"] < 0.06

@@ -1,4 +1,4 @@
-"""The study of robots: its tables from stored rows, and one robot of each part."""
+"""The study of robots: a fit to the motion of a simulated one."""
 
 from __future__ import annotations
 
@@ -12,14 +12,6 @@ from dopt.robots.design import Problem
 from dopt.robots.trajectories import Fourier
 from studies.robots.designs import CONTROL, UNKNOWN, fitted, measured
 from studies.robots.simulated import Friction, SimulatedRobot, jaco
-from studies.robots.tables import TABLES
-
-
-def test_tables_are_made_from_stored_rows() -> None:
-    for made in TABLES:
-        lines = made().splitlines()
-        assert len(lines) > 3, made.__name__
-        assert "nan" not in "".join(lines), made.__name__
 
 
 def test_a_fit_finds_the_parameters_of_a_robot_without_noise() -> None:

@@ -1,39 +1,39 @@
-"""Agreement of kernel and torch path over every choice, determinism, returned parts, stability."""
+"""Agreement of kernel, torch path and plain Python over every choice, determinism, stability."""
 
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
+import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dopt.algorithm import Form
+from dopt.algorithm import Form, Score
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.kernel.from_spec import KINDS, network_of
 from dopt.kernel.linear_algebra import dense, initial_covariance, rank_update
+from dopt.kernel.pointers import function_of
 from dopt.kernel.run import KernelTrial
 from dopt.learning import LEARNERS
-from dopt.learning.base import CustomLearner, Learner, Updater
-from dopt.models import MODELS
+from dopt.learning.base import Learner
+from dopt.models import MODELS, RFF
 from dopt.models.base import Model
-from dopt.policies import POLICIES
-from dopt.policies.base import CustomPolicy, OpenLoop, Planner, Policy
+from dopt.policies import POLICIES, Search
+from dopt.policies.base import ClosedLoop, OpenLoop, Policy
+from dopt.policies.search import SCORES, score_code
 from dopt.result import TrialResult
-from dopt.run import Path, run_trial
+from dopt.run import run_trial
 from dopt.spec.compatibility import REFERENCE_POLICIES, held_information
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS, System
+from dopt.systems import SYSTEMS
+from tests.dopt.custom_plugins import Alternating, Average
 from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.kernel.twin import interpreted, relative_gap, run
-from tests.dopt.newcomers import Alternating, Average
 from tests.dopt.trials import LEARNERS as FIXED
 from tests.dopt.trials import PAIRS, SMALL_GRIDS, SMALL_SEARCHES, covering, trial
-from tests.paths import ROOT
+from tests.paths import printed
 
 ENVS = ("arm", "mass_spring", "pendulum")
 """Systems of which the first one that a choice fits is taken."""
@@ -179,9 +179,6 @@ def test_the_kernel_does_not_pretend_to_run_what_it_lacks() -> None:
     ("what", "sections"),
     [
         ("policy 'exact'", {"policy": {"name": "exact"}}),
-        ("model 'affine'", {"model": {"name": "affine"}}),
-        ("model 'ensemble'", {"model": {"name": "ensemble"}, "learner": {"name": "gauss_newton"}}),
-        ("learner 'ekf'", {"learner": {"name": "ekf"}}),
         ("policy.information 'fresh'", {"policy": {"name": "d_optimal", "information": "fresh"}}),
         ("limits", {"limits": {"bounds": {"φ": [-1.0, 1.0]}}}),
         (
@@ -253,6 +250,28 @@ def test_a_new_policy_or_learner_is_four_files(monkeypatch: pytest.MonkeyPatch) 
     assert relative_gap(fast.parameters, plain.parameters) < 1e-8
 
 
+@pytest.mark.parametrize(
+    ("base", "more"),
+    [(ClosedLoop, {}), (Learner, {"kernel_function": "dopt.kernel.learners.forgotten"})],
+)
+def test_a_kernel_function_that_does_not_exist_is_named(base: Any, more: dict[str, str]) -> None:
+    part = type("New", (base,), {"name": "new", "compiled": True, **more})()
+    with pytest.raises(SpecificationError, match="'new' names the kernel function"):
+        function_of(part, None)
+
+
+def test_a_model_that_the_kernel_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(KINDS, RFF)
+    with pytest.raises(SpecificationError, match="model 'rff' says that it is compiled"):
+        network_of(SYSTEMS["pendulum"](), RFF())
+
+
+def test_every_score_has_a_name_and_each_policy_that_searches_one_of_them() -> None:
+    assert list(SCORES.values()) == list(Score)
+    searching = [cls() for cls in POLICIES.values() if issubclass(cls, Search)]
+    assert {score_code(policy) for policy in searching} >= set(Score) - {Score.JOINT}
+
+
 NUMBERS = ("loss", "reachable_loss", "states", "inputs", "parameters")
 
 
@@ -278,10 +297,7 @@ def test_another_process_gives_the_same_bits() -> None:
         "result = run_trial(trial('cartpole', 'd_optimal', 8))\n"
         f"print(b''.join(getattr(result, name).tobytes() for name in {NUMBERS}).hex())"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert bytes.fromhex(done.stdout) == numbers(run_trial(trial("cartpole", "d_optimal", 8)))
+    assert bytes.fromhex(printed(program)) == numbers(run_trial(trial("cartpole", "d_optimal", 8)))
 
 
 def test_seeds_share_what_they_are_told_apart_by() -> None:
@@ -292,77 +308,43 @@ def test_seeds_share_what_they_are_told_apart_by() -> None:
     assert np.array_equal(one.record.states[0], two.record.states[0])
 
 
-def answering(answer: object) -> SimpleNamespace:
-    """Return a plan whose inputs are given."""
-    return SimpleNamespace(choose=lambda _: answer, observe=print, feedback=print)
+SMALL_MLP = {"name": "mlp", "width": 3, "depth": 1}
+STAR = {"name": "grey_box", "unknown": ["center_x", "center_y"], "initial": [0.1, 0.1]}
+ENCODERS = {"measured_states": [0, 2], "measurement_noise": [0.01, 0.01], "horizon": 6}
+PLAIN_TRIALS = [
+    trial("pendulum", "d_optimal", 1, env={"horizon": 6}, model=SMALL_MLP),
+    trial("moving_star", "lookahead", 1, env={"horizon": 12}, model=STAR),
+    trial("arm", "random", 1, env=ENCODERS, model=SMALL_MLP, learner={"name": "joint_ekf"}),
+]
+PLAIN_PROGRAM = """
+import json, sys
+from numba.core.dispatcher import Dispatcher
+from dopt.kernel import loop
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+assert not isinstance(loop.advance, Dispatcher)
+found = []
+for mapping in json.loads(sys.argv[1]):
+    result = run_trial(TrialSpec.from_mapping(mapping))
+    found.append({name: getattr(result, name).tolist() for name in sys.argv[2:]})
+print(json.dumps(found))
+"""
+EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
+"""What is computed in double precision, and losses, which may be judged in single precision."""
 
 
-GIVEN: dict[str, Any] = {
-    "none": None,
-    "text": "x",
-    "class": Planner,
-    "unwatching": SimpleNamespace(choose=print),
-    "silent": SimpleNamespace(update=lambda _: None),
-    "no input": answering(None),
-    "word": answering("left"),
-    "complex": answering(np.array([1j])),
-    "ragged": answering([[1.0], 2.0]),
-    "nan": answering(np.array([np.nan])),
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bringing(CustomPolicy):
-    name: ClassVar[str] = "bringing"
-    what: str = "none"
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
-        plan: Planner = GIVEN[self.what]
-        return plan
-
-
-@dataclass(frozen=True, kw_only=True)
-class Teaching(CustomLearner):
-    name: ClassVar[str] = "teaching"
-    what: str = "none"
-
-    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
-        update: Updater = GIVEN[self.what]
-        return update
-
-
-INPUT = r"of policy 'bringing' returned {} at step 1, .* \(1,\), .* its choose\(\)"
-
-
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-@pytest.mark.parametrize(
-    ("part", "what", "sentence"),
-    [
-        ("policy", "none", r"^planner\(\) of policy 'bringing' returned None, .*base\.Planner"),
-        ("policy", "text", r"an object of type str, .* return one that has choose, observe"),
-        ("policy", "class", r"returned the class Planner itself, .* return Planner\(\.\.\.\)"),
-        (
-            "policy",
-            "unwatching",
-            r"of type SimpleNamespace, .* return one that has observe, feedback",
-        ),
-        ("learner", "none", r"^updater\(\) of learner 'teaching' returned None, .*base\.Updater"),
-        ("learner", "text", r"returned an object of type str, .* return one that has update"),
-        ("learner", "silent", r"^learner 'teaching' returned None, but parameters .* update\(\)"),
-        ("policy", "no input", INPUT.format("None")),
-        ("policy", "word", INPUT.format("'left'")),
-        ("policy", "complex", INPUT.format(r"array\(\[0\.\+1\.j\]\)")),
-        ("policy", "ragged", INPUT.format(r"\[\[1\.0\], 2\.0\]")),
-        ("policy", "nan", INPUT.format(r"array\(\[nan\]\)")),
-    ],
-)
-def test_what_own_parts_return_is_checked(part: str, what: str, sentence: str, path: Path) -> None:
-    own: Any = {"policy": Bringing(what=what), "learner": Teaching(what=what)}[part]
-    system = SYSTEMS["pendulum"](horizon=5, grid_points=(4, 4))
-    spec = TrialSpec.of_system(system, **({"policy": "random"} | {part: own}))
-    with pytest.raises(SpecificationError, match=sentence) as caught:
-        run_trial(spec, path)
-    assert "\n" not in str(caught.value)
+def test_the_kernel_in_plain_python_gives_the_same_trials() -> None:
+    given = json.dumps([spec.to_mapping() for spec in PLAIN_TRIALS])
+    plain = json.loads(printed(PLAIN_PROGRAM, given, *EXACT, *SINGLE, DOPT_PLAIN="1"))
+    for spec, found in zip(PLAIN_TRIALS, plain, strict=True):
+        compiled = run_trial(spec)
+        for name in EXACT:
+            values = getattr(compiled, name)
+            scale = np.abs(values).max()
+            assert np.array(found[name]) == pytest.approx(values, rel=0.0, abs=1e-12 * scale), name
+        for name in SINGLE:
+            values = getattr(compiled, name)
+            assert np.array(found[name]) == pytest.approx(values, rel=1e-5), name
 
 
 STEPS = 2_000

@@ -1,4 +1,4 @@
-"""Cache of compiled code: damaged files, refusals of the system, and warming."""
+"""Cache of compiled code: damage, refusals of the system, warming, one writer, users' functions."""
 
 from __future__ import annotations
 
@@ -6,29 +6,36 @@ import errno
 import fcntl
 import os
 import pwd
+import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import FunctionType, SimpleNamespace
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import llvmlite.binding
 import numpy as np
 import pytest
 from numba import float64, void
-from numba.core.codegen import CPUCodeLibrary
-from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
 
 from dopt.errors import UnusableEnvironmentError
-from dopt.kernel import cache, compiler, equations, warm_up, warming
-from dopt.kernel.compiler import compiled
-from dopt.kernel.warming import leave_callees_out
+from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
+from dopt.kernel import cache, compiler, equations, pointers, warm_up
+from dopt.kernel.compiler import content_digest
+from dopt.kernel.information import FORMS
+from dopt.kernel.run import trial_in_kernel
+from dopt.kernel.warming import choices, kernel_parts, needed_parts
+from dopt.learning import LEARNERS
+from dopt.policies import POLICIES
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from dopt.types import Vector
-from tests.paths import ROOT, loaded
+from tests.dopt import trials
+from tests.paths import ROOT, loaded, printed
+from tests.waiting import PATIENCE_SECONDS
 
 MODULE = "A, B = 1.0, 2.0\n\ndef triple(x, out):\n    out[0] = (A + B) * x\n"
 SIGNATURE = void(float64, float64[::1])
@@ -120,14 +127,6 @@ def test_what_is_damaged_is_compiled_again_and_said(
     caplog.clear()
     assert found(triple)
     assert not caplog.messages
-
-
-@pytest.mark.usefixtures("folder")
-def test_a_changed_constant_makes_other_code(triple: FunctionType, tmp_path: Path) -> None:
-    """The function itself stays the same, and so does what it returns."""
-    assert not found(triple)
-    assert found(triple)
-    assert not found(written(tmp_path / "own_triple.py", MODULE.replace("1.0, 2.0", "2.0, 1.0")))
 
 
 def test_a_damaged_part_is_missing_before_a_trial_asks_for_it(folder: Path) -> None:
@@ -416,46 +415,234 @@ class TestReports:
             assert caplog.messages
 
 
-@pytest.fixture
-def as_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let Numba be as it is when the test has ended."""
-    for owner, name in (
-        (CPUCodeLibrary, "_optimize_final_module"),
-        (CPUCodeLibrary, "_finalize_final_module"),
-        (CPUContext, "get_executable"),
-    ):
-        monkeypatch.setattr(owner, name, getattr(owner, name))
+def cache_without(folder: Path, *names: str) -> str:
+    """Return a folder in which the cache is the warm one without some files."""
+    warm_up()
+    copy, without = folder / "dopt" / cache.CACHE_FOLDER.name, shutil.ignore_patterns(*names)
+    shutil.copytree(cache.CACHE_FOLDER, copy, copy_function=os.symlink, ignore=without)
+    return str(folder)
 
 
-def test_callees_have_no_code_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And callees are optimized in their callers alone."""
-    optimized: list[str] = []
+@pytest.mark.usefixtures("folder")
+def test_a_second_compiler_of_a_function_waits_for_the_first() -> None:
+    first_ended, second_entered = threading.Event(), threading.Event()
+    after_first = []
 
-    def optimize(library: CPUCodeLibrary) -> None:
-        optimized.append(library.name)
-        whole(library)
+    def second() -> None:
+        with cache.one_compiler_at_a_time("loop-second"):
+            after_first.append(first_ended.is_set())
+            second_entered.set()
 
-    whole = warming._optimize
-    monkeypatch.setattr(warming, "_optimize", optimize)
+    with cache.one_compiler_at_a_time("loop-first"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        assert not second_entered.wait(0.2)
+        with cache.one_compiler_at_a_time("equations"):
+            first_ended.set()
+    thread.join(PATIENCE_SECONDS)
+    assert after_first == [True]
 
-    @compiled
-    def total(values: Vector) -> float:
-        result = 0.0
-        for value in values:
-            if value < 0.0:
-                raise ValueError("a value is below zero")
-            result += value
-        return result
 
-    @compiled
-    def mean(values: Vector) -> float:
-        return total(values) / len(values)
+def test_what_is_in_the_cache_is_read_by_all_at_once_and_what_failed_is_not(folder: Path) -> None:
+    with pytest.raises(KeyError), cache.one_compiler_at_a_time("loop"):
+        raise KeyError
+    assert not (folder / "loop.complete").exists()
+    with cache.one_compiler_at_a_time("loop"):
+        pass
+    with cache.one_compiler_at_a_time("other"), cache.one_compiler_at_a_time("loop"):
+        assert (folder / "loop.complete").exists()
 
-    leave_callees_out()
-    assert mean(np.array([1.0, 2.0, 6.0])) == 3.0
-    with pytest.raises(ValueError, match="below zero"):
-        mean(np.array([1.0, -2.0]))
-    for function, count in ((mean, 1), (total, 0)):
-        [result] = function.overloads.values()  # has the compiler's back end made code of it?
-        assert (result.library._compiled_object is not None) == count
-        assert sum(function.__name__ in name for name in optimized) == count
+
+def test_a_warm_cache_is_seen_without_the_compiler_and_a_trial_runs_without_its_rules() -> None:
+    """Numba would load the rules first, for a tenth of a second in every process."""
+    warm_up()
+    printed(
+        "import sys; from dopt.kernel import warm_up; warm_up(); "
+        "assert 'numba' not in sys.modules; from dopt import TrialSpec, run_trial; "
+        "run_trial(TrialSpec.from_names('pendulum', 'd_optimal')); "
+        "assert not {'numba.np.arraymath', 'numba.typed.typeddict'} & {*sys.modules}"
+    )
+
+
+def test_everything_is_what_any_shipped_choice_calls() -> None:
+    """Beside them stand the functions that call users' parts in numpy."""
+    chosen = choices(everything=True)
+    plans = {one.kernel_function for one in POLICIES.values() if one.compiled}
+    learns = {one.kernel_function for one in LEARNERS.values() if one.compiled}
+    assert plans | {PLAN_IN_NUMPY} == set(chosen.plans)
+    assert learns | {LEARN_IN_NUMPY} == set(chosen.learns)
+    assert chosen.forms == FORMS
+    few = choices(everything=False)
+    assert set(few.plans) < set(chosen.plans)
+
+
+def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
+    """Where a trial compiles a part itself, its numbers can differ from later trials."""
+    program = """
+from dopt.kernel.cache import compile_missing, missing
+from dopt.kernel.information import add_nothing
+from dopt.kernel.pointers import compile_form
+from dopt.kernel.run import KernelTrial
+from dopt.spec.trial import TrialSpec
+part = "dopt.kernel.information.add_nothing"
+assert missing([part]) == [part]
+compile_missing([part])
+trial = KernelTrial(TrialSpec.from_names("pendulum", "random")).trial
+compile_form(trial, "add_rows", add_nothing)
+print(sum(add_nothing.stats.cache_hits.values()), sum(add_nothing.stats.cache_misses.values()))
+"""
+    assert printed(program, DOPT_CACHE=cache_without(tmp_path, "*add_nothing*")) == "1 0\n"
+
+
+GRID = {
+    "paper": [("pendulum", policy) for policy in ("d_optimal", "random", "periodic", "uniform")],
+    "search": [("cartpole", "lookahead"), ("arm", "icem")],
+    "numpy": [("pendulum", "max")],
+    "measured": [
+        ({"name": "pendulum", "measured_states": [0], "measurement_noise": [0.01]}, "random")
+    ],
+}
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_a_grid_compiles_what_its_trials_ask_for(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """A part that were missing would be compiled while the workers wait for it."""
+    specs = [TrialSpec.from_names(system, policy) for system, policy in GRID[name]]
+    asked: list[str] = []
+    monkeypatch.setattr(pointers, "compile_missing", asked.extend)
+    monkeypatch.setattr(pointers, "_trials", {})
+    for spec in specs:
+        trial_in_kernel(spec).advance(1)
+    systems = {equations.name_of_equations(spec.system) for spec in specs}
+    assert {*needed_parts(spec.config for spec in specs)} == {*asked} | systems
+    assert {*asked} <= {*kernel_parts(everything=True)}
+
+
+def test_a_second_grid_of_the_same_kinds_is_seen_without_the_compiler(tmp_path: Path) -> None:
+    program = """
+import sys
+from dopt.kernel import compiling
+from dopt.spec.trial import TrialSpec
+system = {"name": "mass_spring", "horizon": int(sys.argv[1])}
+with compiling([TrialSpec.from_names(system, "random").config]):
+    print("numba" in sys.modules)
+"""
+    folder = cache_without(tmp_path, "kinds-*")
+    answers = [printed(program, horizon, DOPT_CACHE=folder) for horizon in ("100", "200")]
+    assert answers == ["True\n", "False\n"]
+
+
+def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
+    """The same sources in another folder: nothing is compiled, and the numbers are the same."""
+    program = """
+import numpy as np
+from dopt.kernel.equations import compiled_equations
+from dopt.systems import SYSTEMS
+function = compiled_equations(SYSTEMS["pendulum"]()).accelerations
+out = np.empty(1)
+function(np.ones(2), np.array(SYSTEMS["pendulum"]().parameters), out)
+print(sum(function.stats.cache_misses.values()), out[0].hex())
+"""
+    shutil.copytree(ROOT / "dopt", tmp_path / "elsewhere/dopt")
+    folder = str(tmp_path / "cache")
+    (missed, number), (again, same) = (
+        printed(program, folder=one, DOPT_CACHE=folder, PYTHONPATH=str(one)).split()
+        for one in (ROOT, tmp_path / "elsewhere")
+    )
+    assert (missed, again) == ("1", "0")
+    assert number == same
+
+
+def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_path: Path) -> None:
+    """Whoever opened the second would compile its argument, without what its module prepares."""
+    (tmp_path / "pair.py").write_text(
+        """
+from pathlib import Path
+from dopt.kernel import compiler
+compiler._PACKAGE = Path(__file__).parent
+from dopt.kernel.compiler import compiled
+@compiled
+def inner(x):
+    return x + 1.0
+@compiled
+def outer(x):
+    return 2.0 * inner(x)
+@compiled
+def applied(functions, x):
+    return 2.0 * functions[0](x)
+assert outer(1.0) == applied((inner,), 1.0) == 4.0
+"""
+    )
+    printed("import pair", folder=tmp_path, DOPT_CACHE=str(tmp_path / "cache"))
+    found = [path.name.partition("-")[0] for path in tmp_path.rglob("*.nbi")]
+    assert found == ["pair.outer"]
+
+
+def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path: Path) -> None:
+    """And is gone with the process that made it."""
+    program = """
+import subprocess, sys
+from dopt.kernel.cache import CACHE_FOLDER
+print(CACHE_FOLDER, flush=True)
+if len(sys.argv) < 3:
+    subprocess.run([sys.executable, "-c", sys.argv[1], sys.argv[1], "child"], check=True)
+print(CACHE_FOLDER.is_dir())
+"""
+    (tmp_path / "file").touch()
+    said = printed(program, program, DOPT_CACHE=str(tmp_path / "file" / "cache"))
+    made, used, there, still_there = said.split()
+    assert (made, there, still_there) == (used, "True", "True")
+    assert not Path(made).exists()
+
+
+CONSTANTS = """
+import math
+import numpy as np
+from dopt.kernel.vectors import inner
+
+FACTOR = {factor}
+TABLE = np.array([1.0, 2.0])
+
+def half(x):
+    return FACTOR * x
+
+def plan(x, out):
+    out[0] = half(x) + TABLE[1] + math.sqrt(4.0) + 0.0 * inner(out, out)
+"""
+
+
+def function_with(folder: Path, **values: object) -> FunctionType:
+    """Return the plan of a module in which names have other values than its file says."""
+    path = folder / "own.py"
+    path.write_text(CONSTANTS.format(factor=0.5))
+    module = ModuleType("own")
+    exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
+    module.__dict__.update(values)
+    function: FunctionType = module.plan
+    return function
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_constant_from_elsewhere_is_part_of_the_content(
+    triple: FunctionType, tmp_path: Path
+) -> None:
+    usual = content_digest(function_with(tmp_path))
+    assert usual is not None
+    assert content_digest(function_with(tmp_path)) == usual
+    for value in (0.25, True, (1.0, 2.0), "text", np.array([3.0])):
+        other = content_digest(function_with(tmp_path, FACTOR=value))
+        assert other not in (None, usual)
+    assert not found(triple)
+    assert found(triple)
+    same_sum = MODULE.replace("1.0, 2.0", "2.0, 1.0")
+    assert not found(written(tmp_path / "own_triple.py", same_sum)), "other code"
+
+
+def test_what_cannot_be_told_or_has_no_file_is_not_kept(tmp_path: Path) -> None:
+    for value in ([1.0], {"a": 1}, trials, trials.trial, object()):
+        assert content_digest(function_with(tmp_path, FACTOR=value)) is None
+    names: dict[str, FunctionType] = {}
+    exec("def plan(x, out):\n    out[0] = x\n", names)
+    assert content_digest(names["plan"]) is None

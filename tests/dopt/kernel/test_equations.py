@@ -1,4 +1,4 @@
-"""Compiled equations, steps, pointers to structures, episodes and evaluation."""
+"""Compiled equations, steps, pointers to structures, callees, episodes and evaluation."""
 
 from __future__ import annotations
 
@@ -11,29 +11,35 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from numba.core.codegen import CPUCodeLibrary
+from numba.core.cpu import CPUContext
 from numba.core.errors import TypingError
 
 from dopt.evaluation import evaluation_set
-from dopt.kernel import cache, run
+from dopt.kernel import cache, run, warming
+from dopt.kernel.compiler import compiled
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.held import HeldTrial, pointer_to, trial_in
 from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
 from dopt.kernel.run import KernelTrial, run_trial_in_kernel
+from dopt.kernel.warming import leave_callees_out
 from dopt.policies import Episodic
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Chain, Pendulum, System
 from dopt.types import Vector
 from tests.dopt.custom_networks import model_of_one
+from tests.dopt.custom_plugins import kept
 from tests.dopt.kernel.twin import relative_gap
-from tests.dopt.newcomers import kept
 from tests.dopt.trials import trial
 
+ALL = [*(cls() for cls in SYSTEMS.values()), Chain(n_links=3)]
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_compiled_equations_are_those_of_the_system(name: str) -> None:
-    system, rng = SYSTEMS[name](), np.random.default_rng(0)
-    equations, p = compiled_equations(system), np.array(SYSTEMS[name]().parameters)
+
+@pytest.mark.parametrize("system", ALL, ids=lambda system: f"{system.name}-{system.n_states}")
+def test_compiled_equations_are_those_of_the_system(system: System) -> None:
+    rng = np.random.default_rng(0)
+    equations, p = compiled_equations(system), np.array(system.parameters)
     x, u = rng.standard_normal(system.n_states), rng.standard_normal(system.n_inputs)
     known, learned = np.empty(system.n_states), np.empty(system.n_learned)
     equations.known(x, u, p, known)
@@ -248,3 +254,43 @@ def test_steps_that_are_done_are_not_done_again() -> None:
         back.advance(last)
     np.testing.assert_array_equal(back.parameters, straight.parameters)
     assert np.isnan(back.states[21:]).all()
+
+
+def test_callees_have_no_code_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And callees are optimized in their callers alone."""
+    for owner, name in (
+        (CPUCodeLibrary, "_optimize_final_module"),
+        (CPUCodeLibrary, "_finalize_final_module"),
+        (CPUContext, "get_executable"),
+    ):
+        monkeypatch.setattr(owner, name, getattr(owner, name))  # is as before when the test ends
+    optimized: list[str] = []
+
+    def optimize(library: CPUCodeLibrary) -> None:
+        optimized.append(library.name)
+        whole(library)
+
+    whole = warming._optimize
+    monkeypatch.setattr(warming, "_optimize", optimize)
+
+    @compiled
+    def total(values: Vector) -> float:
+        result = 0.0
+        for value in values:
+            if value < 0.0:
+                raise ValueError("a value is below zero")
+            result += value
+        return result
+
+    @compiled
+    def mean(values: Vector) -> float:
+        return total(values) / len(values)
+
+    leave_callees_out()
+    assert mean(np.array([1.0, 2.0, 6.0])) == 3.0
+    with pytest.raises(ValueError, match="below zero"):
+        mean(np.array([1.0, -2.0]))
+    for function, count in ((mean, 1), (total, 0)):
+        [result] = function.overloads.values()  # has the compiler's back end made code of it?
+        assert (result.library._compiled_object is not None) == count
+        assert sum(function.__name__ in name for name in optimized) == count

@@ -24,8 +24,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.dopt.custom_networks import model_of_one
 from tests.dopt.kernel import twin
-from tests.dopt.kernel.twin import model_of_kernel, observed, relative_gap
-from tests.dopt.oracles.traces import jacobian, model_step
+from tests.dopt.oracles.traces import jacobian, model_step, observed
 from tests.dopt.trials import trial
 
 GAUSS_NEWTON = {"name": "gauss_newton"}
@@ -49,8 +48,9 @@ def advanced(
 
 def linearized(fast: KernelTrial, theta: Array, first: int = 0) -> tuple[Array, Array]:
     """Return J, (n r, q), and e, (n r,), of the samples from ``first`` on."""
-    system, states = fast.spec.system, fast.record.states[first : fast.done]
-    errors = observed(fast, fast.done)[first:] - fast.spec.model.predict(system, theta, states)
+    states = fast.record.states[first : fast.done]
+    targets = observed(fast.spec, fast.record)[first : fast.done]
+    errors = targets - fast.spec.model.predict(fast.spec.system, theta, states)
     return jacobian(fast.spec, theta, states).reshape(-1, len(theta)), errors.ravel()
 
 
@@ -167,58 +167,16 @@ def test_a_step_follows_the_gradient_over_the_newest_samples_in_the_drawn_places
         fast.advance(t + 1)
         kept[t % 7] = t
         times = [kept[place] for place in places[t, 0].tolist()]
-        states, targets = map(torch.tensor, (fast.record.states, observed(fast, t + 1)))
+        states, targets = map(torch.tensor, (fast.record.states, observed(spec, fast.record)))
         expected = grad(loss)(before, states[times], targets[times])
         scale = float(expected.abs().max())
         # Without momentum the first moment of Adam is the gradient itself.
         assert fast.state.moment_1 == pytest.approx(expected.numpy(), rel=0.0, abs=1e-9 * scale)
 
 
-FEATURES = {"name": "rff", "n_features": 30}
-
-
-def features(env: str, policy: str = "d_optimal", /, **fields: Any) -> TrialSpec:
-    """Return a small trial that learns random features."""
-    sections: dict[str, Any] = {
-        "model": FEATURES,
-        "learner": {"name": "recursive_least_squares"},
-        "env": {"horizon": 9},
-    }
-    merged = {key: sections.get(key, {}) | entries for key, entries in fields.items()}
-    return trial(env, policy, 3, **(sections | merged))
-
-
-@pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
-def test_the_inverse_information_is_that_of_all_rows_of_the_learned_parameters(policy: str) -> None:
-    """With the ridge of a policy that plans by it, or the learner's."""
-    ridges = {"learner": {"regularization": 3e-2}}
-    if policy == "d_optimal":
-        ridges["policy"] = {"regularization": 1e-2}
-    fast = KernelTrial(features("arm", policy, env={"horizon": 37}, **ridges))
-    fast.advance(37)
-    spec, drawn = fast.spec, fast.parameters[60:]
-    units = np.concatenate([np.eye(60), np.tile(drawn, (60, 1))], axis=1)
-    states = fast.states[:-1]
-    columns = [spec.model.predict(spec.system, unit, states).ravel() for unit in units]
-    J = np.stack(columns, axis=1)
-    M = (1e-2 if policy == "d_optimal" else 3e-2) * np.eye(60) + J.T @ J
-    twin.check_inverse(fast, M, 1e-8)
-
-
-@pytest.mark.parametrize("env", ["pendulum", "arm", "quadrotor"])
-def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
-    spec, rng, h = features(env), np.random.default_rng(0), 1e-5
-    model = model_of_kernel(spec)
-    for _ in range(5):
-        x, direction = rng.normal(size=(2, spec.system.n_states))
-        ahead, behind = model.jacobian(x + h * direction), model.jacobian(x - h * direction)
-        change = model.jacobian_change(x, direction[None])[0]
-        for k, expected in enumerate((ahead - behind) / (2.0 * h)):
-            assert relative_gap(change[k], expected) < 1e-8
-
-
 def test_memory_counts_the_features_at_the_evaluation_points() -> None:
-    spec = features("pendulum", env={"grid_points": [64, 64]}, model={"n_features": 200})
+    features = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+    spec = trial("pendulum", "d_optimal", 3, env={"grid_points": [64, 64]}, **features)
     points = points_of_trial(shared_points(spec.config), KernelTrial(spec).trial.network)
     q = 200
     assert spec.config.memory >= points.basis.nbytes + 8 * q**2

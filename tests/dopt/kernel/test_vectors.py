@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -17,7 +15,7 @@ from hypothesis import strategies as st
 from dopt.kernel import vectors
 from dopt.kernel.vectors import GROUP, LANES, aligned_zeros, padded
 from dopt.types import Array
-from tests.paths import ROOT
+from tests.paths import printed
 
 SIZES = st.integers(1, 40)
 PRECISIONS = st.sampled_from([(np.float64, 1e-13), (np.float32, 1e-5)])
@@ -188,13 +186,8 @@ found = digest.hexdigest()
 
 def digest_on(processor: str) -> str:
     """Return a digest of products, which are checked, on another processor."""
-    forced = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", f"{PROGRAM}print(found)"]
-    done = subprocess.run(
-        command, env=os.environ | forced, cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    forced = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ""}
+    return printed(f"{PROGRAM}print(found, end='')", **forced)
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64", reason="the other processors are x86-64 too")

@@ -18,17 +18,7 @@ from dopt.kernel.structs import Evaluation
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView
 from dopt.types import Array, CompiledFunction, Matrix
-from tests.dopt.newcomers import kept
-
-
-def observed(trial: KernelTrial, t: int) -> Array:
-    """Return the accelerations observed in the first t steps by the Euler map, (t, r)."""
-    system, states = trial.spec.system, trial.record.states[: t + 1]
-    x, u = states[:-1], trial.record.inputs[:t]
-    known = system.known(tuple(x.T), tuple(u.T), system.parameters)
-    flow = np.stack(np.broadcast_arrays(*known, x[:, 0])[:-1], axis=-1)
-    found: Array = ((states[1:] - x) / system.dt - flow)[:, list(system.learned_rows)]
-    return found
+from tests.dopt.custom_plugins import kept
 
 
 def relative_gap(values: Array, expected: Array) -> float:

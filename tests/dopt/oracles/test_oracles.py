@@ -236,7 +236,7 @@ class Conditioned:
         self._noise = max(spec.system.noise**2 / spec.system.dt, 1e-10 * self._model.amplitude**2)
         K = self.kernel(self._seen, self._seen) + self._noise * np.eye(t)
         self._inverse = np.linalg.inv(K)
-        self.weights = self._inverse @ np.array([observed(spec, run, s) for s in range(t)])
+        self.weights = self._inverse @ observed(spec, run)[:t]
 
     def kernel(self, a: Array, b: Array) -> Array:
         squares = ((a[:, None] - b[None]) ** 2).sum(axis=2)
@@ -286,7 +286,7 @@ def fitted(spec: TrialSpec, run: Trace, t: int, theta: Array, prior: Array) -> A
     learner, network = spec.learner, MLP(width=spec.model.width, depth=spec.model.depth)  # type: ignore[attr-defined]  # an ensemble
     assert isinstance(learner, GaussNewton)
     states = run.states[: t + 1][-learner.capacity :]
-    targets = np.array([observed(spec, run, s) for s in range(t + 1)])[-learner.capacity :]
+    targets = observed(spec, run)[: t + 1][-learner.capacity :]
     ridge = learner.regularization * learner.noise_variance
 
     def errors(at: Array) -> Array:
@@ -476,10 +476,10 @@ def allowed(bounds: Bounds, run: Trace, planned: Array, t: int) -> Array:
     """Return the input of step t in the place of a planned one, (m,), without information."""
     spec = bounds.spec
     before = run.inputs[t - 1] if t else np.zeros(spec.system.n_inputs)
-    scale = np.zeros(spec.system.n_learned)
+    seen, scale = observed(spec, run), np.zeros(spec.system.n_learned)
     for s in range(t):
         value = accelerations(spec, run.parameters[s], run.states[s], run.inputs[s])
-        scale += max(1 / (s + 1), 1 / 25) * ((observed(spec, run, s) - value) ** 2 - scale)
+        scale += max(1 / (s + 1), 1 / 25) * ((seen[s] - value) ** 2 - scale)
     tried = [bounds.moved(before, u) for u in (planned, -planned, *bounds.backups)]
     errors = bounds.margin * np.sqrt(scale)
     found = [bounds.excess(run.parameters[t], run.states[t], u, errors) for u in tried]

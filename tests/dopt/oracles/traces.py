@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.kernel.run import trial_in_kernel
+from dopt.kernel.structs import Record
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 
@@ -58,11 +59,12 @@ def model_step(spec: TrialSpec, theta: Array, x: Array, u: Array) -> Array:
     return following(spec, x, u, accelerations(spec, theta, x, u))
 
 
-def observed(spec: TrialSpec, run: Trace, t: int) -> Array:
-    """Return the accelerations, (r,), that step t of a trial by the Euler map shows."""
-    still = following(spec, run.states[t], run.inputs[t], np.zeros(spec.system.n_learned))
-    rows = list(spec.system.learned_rows)
-    found: Array = (run.states[t + 1] - still)[rows] / spec.system.dt
+def observed(spec: TrialSpec, run: Trace | Record) -> Array:
+    """Return the accelerations, (T, r), that the steps of a trial by the Euler map show."""
+    system, x, u = spec.system, run.states[:-1], run.inputs
+    known = system.known(tuple(x.T), tuple(u.T), system.parameters)
+    flow = np.stack(np.broadcast_arrays(*known, x[:, 0])[:-1], axis=-1)
+    found: Array = ((run.states[1:] - x) / system.dt - flow)[:, list(system.learned_rows)]
     return found
 
 

@@ -66,7 +66,8 @@ class Mechanics(ABC):
         mass_matrix = hessian(self.kinetic, argnums=1)(q, rates)
         momentum_by_q = jacfwd(grad(self.kinetic, argnums=1), argnums=0)(q, rates)
         slope = grad(self.kinetic)(q, rates) - grad(self.potential)(q)
-        forces = self.driving(q, rates, u) + self.friction(rates)
+        forces = self.driving(q, rates, getattr(self.system, "gain", 1.0) * u)
+        forces = forces + self.friction(rates)
         return torch.linalg.solve(mass_matrix, forces + slope - momentum_by_q @ rates)
 
 
@@ -351,16 +352,6 @@ class VanDerPolMechanics(Mechanics):
         return u + self.system.damping * inside * rates
 
 
-class PendulumUnknownGainMechanics(PendulumMechanics):
-    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
-        return super().driving(q, rates, self.system.gain * u)
-
-
-class CartpoleUnknownGainMechanics(CartpoleMechanics):
-    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
-        return super().driving(q, rates, self.system.gain * u)
-
-
 MECHANICS: dict[str, type[Mechanics]] = {
     "pendulum": PendulumMechanics,
     "cartpole": CartpoleMechanics,
@@ -369,8 +360,8 @@ MECHANICS: dict[str, type[Mechanics]] = {
     "mass_spring": MassSpringMechanics,
     "drifting_pendulum": PendulumMechanics,
     "chain": ChainMechanics,
-    "pendulum_unknown_gain": PendulumUnknownGainMechanics,
-    "cartpole_unknown_gain": CartpoleUnknownGainMechanics,
+    "pendulum_unknown_gain": PendulumMechanics,
+    "cartpole_unknown_gain": CartpoleMechanics,
     "unbalanced_disk": UnbalancedDiskMechanics,
     "coupled_pendulums": CoupledPendulumsMechanics,
     "van_der_pol": VanDerPolMechanics,

@@ -1,4 +1,4 @@
-"""Random systems, states and inputs, and a check of compiled equations."""
+"""Random systems, states and inputs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dopt.kernel.equations import compiled_equations
 from dopt.systems import SYSTEMS, System
 
 NAMES = sorted(SYSTEMS)
@@ -43,14 +41,3 @@ def inputs(name: str, bound: float = 10.0) -> st.SearchStrategy[np.ndarray]:
 
 def vectors(size: int, bound: float) -> st.SearchStrategy[np.ndarray]:
     return arrays(np.float64, size, elements=st.floats(-bound, bound))
-
-
-def assert_compiled_equations_agree(system: System, x: np.ndarray, u: np.ndarray) -> None:
-    """Compare f(x, u) of the compiled equations with the system's."""
-    equations = compiled_equations(system)
-    p, flow = np.array(system.parameters), np.empty(system.n_states)
-    learned = np.empty(system.n_learned)
-    equations.known(x, u, p, flow)
-    equations.accelerations(x, p, learned)
-    flow[list(system.learned_rows)] += learned
-    assert flow == pytest.approx(system.derivative(x, u), rel=1e-11, abs=1e-12)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from dopt.registry import section_of
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS, Feature, Pendulum, Real, System, system_from_mapping
+from dopt.systems import SYSTEMS, Pendulum, Real, System, system_from_mapping
 from dopt.systems.black_box import BlackBox, transitions
 from dopt.types import Array
 from tests.dopt.trials import trial
@@ -179,47 +178,19 @@ def test_what_does_not_go_together_is_refused(system: System, hardware: Any, mes
         Real(system, **hardware)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cart(BlackBox):
-    """A mass that an episode moves, with friction that is learned."""
-
-    name: ClassVar[str] = "stepped_cart"
-    state_labels: ClassVar[tuple[str, ...]] = ("x [m]", "v [m/s]")
-    input_labels: ClassVar[tuple[str, ...]] = ("u [N]",)
-    learned_rows: ClassVar[tuple[int, ...]] = (1,)
-    features: ClassVar[tuple[Feature, ...]] = (Feature("identity", 1),)
-    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
-    grid_indices: ClassVar[tuple[int, ...]] = (1,)
-    grid_half_widths: tuple[float, ...] = (2.0,)
-    grid_points: tuple[int, ...] = (16,)
-
-    @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> Any:  # noqa: ARG004
-        return state[1], inputs[0]
-
-    def episode(self, seed: int) -> Any:  # noqa: ARG002
-        return Rolling()
-
-
-class Rolling:
-    def __init__(self) -> None:
-        self.state = np.zeros(2)
-
-    def step(self, u: Array) -> Array:
-        x, v = self.state
-        self.state = np.array([x + 0.02 * v, v + 0.02 * (u[0] - 0.5 * v)])
-        return u
-
-
 def test_a_black_box_behind_hardware_shows_its_own_accelerations() -> None:
-    real = Real(Cart(), delay=1.4, lag=0.05, supply=0.5)
+    pytest.importorskip("gymnasium", reason="needs the extra gymnasium")
+    from tests.dopt.custom_environments import DRAG, Point
+
+    cart = Point(id="dopt_tests/Double-v0")
+    real = Real(cart, delay=1.4, lag=0.25, supply=0.5)
     assert isinstance(real, BlackBox)
     inputs = np.random.default_rng(0).uniform(-1, 1, (50, 1))
     states, applied, seen, there = transitions(real, inputs, 0)
     assert there.all()
     assert np.abs(applied).max() == 0.5
-    np.testing.assert_allclose(seen[:, 0], -0.5 * states[:, 1], atol=1e-9)
-    ideal = Rolling()
+    np.testing.assert_allclose(seen[:, 0], -DRAG * states[:, 1], atol=1e-9)
+    ideal = cart.episode(0)
     for w in applied:
         ideal.step(w)
     assert not np.allclose(states[-1, :2], ideal.state, atol=1e-3)
