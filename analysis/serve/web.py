@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import json
 import math
-import secrets
 import threading
 import time
 from collections import OrderedDict
@@ -30,7 +29,7 @@ from analysis.data.selection import Selection, select
 from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
-from orchestrate.store.backends.base import parse_url, public_url, read_login, sqlite_path
+from orchestrate.store.backends.base import parse_url, public_url, sqlite_path
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -48,14 +47,6 @@ class RequestError(AnalysisError):
 
 class NotFoundError(AnalysisError):
     """The trial does not exist."""
-
-
-class ForbiddenError(AnalysisError):
-    """The request comes from another site, or needs a right that is not given."""
-
-
-class BusyError(AnalysisError):
-    """Too many queries are running."""
 
 
 class QueryParams:
@@ -210,7 +201,6 @@ _pages.filters.update(
     duration=duration,
     mebibytes=lambda count: "–" if count is None else f"{count / 2**20:.0f} MiB",
     title=environment_title,
-    exact=lambda value: f"{value:.10g}",
 )
 
 
@@ -243,9 +233,6 @@ class Database:
         parsed = parse_url(url)
         self.safe_url = public_url(parsed)
         self._url = url
-        self.is_file = parsed.get_backend_name() != "postgresql"
-        self.user = parsed.username
-        self.read_login = read_login(parsed)
         self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
         self._lock = threading.Lock()
         self._reader: Reader | None = None
@@ -378,14 +365,9 @@ class Events:
 
 @dataclass(frozen=True)
 class ServerState:
-    """The database with its event stream, and caches of computed values.
-
-    ``exposed``: other machines reach the server. ``token``: secret of this process's forms.
-    """
+    """The database with its event stream, and caches of computed values."""
 
     database: Database
-    exposed: bool = False
-    token: str = field(default_factory=secrets.token_urlsafe)
     cache: Cache = field(default_factory=Cache)
     selections: Cache = field(default_factory=lambda: Cache(6))  # each contains all its trials
 
