@@ -383,20 +383,12 @@ def one_each(
     return [max(group, key=weight) for group in groups.values()]
 
 
-def unfinished(
-    entries: Iterable[Entry],
-    name: Callable[[ConfigRow], str] | None = None,
-    what: str = "trials are not finished",
-) -> Iterator[str]:
-    """Yield a sentence for each entry that has trials which are not finished.
-
-    ``name`` names a configuration, by default by its environment and the label of the entry.
-    """
+def unfinished(entries: Iterable[Entry]) -> Iterator[str]:
+    """Yield a sentence for each entry that has trials which are not finished."""
     for entry in entries:
         missing = len(entry.trials) - len(entry.finished)
         if missing:
-            own = name(entry.config) if name else f"{entry.config.env}, {entry.label}"
-            yield f"{own}: {missing} {what}"
+            yield f"{entry.config.env}, {entry.label}: {missing} trials are not finished"
 
 
 def section_text(entry: Entry, name: str) -> str:

@@ -9,22 +9,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from analysis.data.matching import choose
 from analysis.data.samples import DivergenceRule, read_sample
-from analysis.data.selection import (
-    Entry,
-    Selection,
-    environment_rank,
-    labelled,
-    policy_rank,
-    unfinished,
-)
+from analysis.data.selection import Entry
 from analysis.stats.curves import CONFIDENCE, band, interval_of_mean
 from analysis.style import of_finished
 from orchestrate.store import Assessments, Reader
@@ -298,24 +290,6 @@ def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 
 Interval = tuple[float, float, float]
 """Centre, low and high."""
-
-
-def control_part(selection: Selection) -> Selection:
-    """Return the entries with a task, in each environment the task with most trials."""
-    asked = [entry for entry in selection.stored if task_of(entry)]
-    chosen: list[Entry] = []
-    for env in dict.fromkeys(entry.config.env for entry in asked):
-        own = [entry for entry in asked if entry.config.env == env]
-        most = common_task(own)
-        same = {entry.config.config_key: entry for entry in own if task_of(entry) == most}
-        configs = choose((entry.config for entry in same.values()), selection.reference)
-        chosen += [same[config.config_key] for config in configs]
-    chosen.sort(key=lambda e: (environment_rank(e.config.env), policy_rank(e.config.policy)))
-    entries = tuple(labelled(chosen))
-    notes = unfinished(
-        chosen, lambda one: f"{one.env} × {one.policy}", "trials with a task not finished"
-    )
-    return replace(selection, entries=entries, gaps=(), notes=tuple(notes), stored=entries)
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:

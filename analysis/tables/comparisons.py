@@ -21,7 +21,7 @@ import pandas as pd
 from analysis.data.matching import AnalysisError, nearness
 from analysis.data.samples import DivergenceRule, sample_losses
 from analysis.data.selection import Entry, Selection
-from analysis.stats.curves import Statistic, centre, mean, mean_columns, stratified_mean
+from analysis.stats.curves import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
     Measure,
@@ -31,10 +31,7 @@ from analysis.stats.scores import (
     compare_hitting_times,
     final_losses,
     mean_losses,
-    relative_costs,
-    scores_at,
     steps_to,
-    without_ratio,
 )
 from orchestrate.store import Reader
 
@@ -150,34 +147,6 @@ def loss_of_random_inputs(
     return float(np.median(final_losses(reader, usual, column, rule).values))
 
 
-def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
-    """Return the ratio of the costs of control, one row for each environment, step and variant.
-
-    The cost of a trial: of the episode that its model planned, relative to the true model's.
-    ``n_lost`` pairs are in no ratio: one of the two episodes, or the true model's, has no finite
-    cost. An episode's own loss counts as the worst in the test; where the true model's was lost,
-    nothing is known.
-    """
-    rows: list[dict[str, object]] = []
-    for env in selection.environments:
-        entries = selection.of(env)
-        steps = sorted({int(t) for entry in entries for t in relative_costs(reader, entry).t})
-        for t in steps:
-            if t == 0:  # the same untrained model for all
-                continue
-            successes = {entry.label: _successes(reader, entry, t) for entry in entries}
-            scores = [scores_at(reader, entry, t) for entry in entries]
-            rows += _rows(selection, env, scores, partial(_controlled, t, successes))
-    return _adjusted(rows, selection)
-
-
-def _successes(reader: Reader, entry: Entry, t: int) -> float:
-    """Return the share of successful episodes after t explored steps, NaN for none."""
-    found = reader.assessments(entry.config.config_key, "control_success")
-    known = found.values[:, found.t == t]
-    return float(mean(known[np.isfinite(known)]))
-
-
 def references(selection: Selection, env: str) -> Iterator[tuple[Entry, Entry, bool]]:
     """Yield each variant of an environment, its reference, and whether they share a group.
 
@@ -242,16 +211,6 @@ def _against(own: Scores, reference: Scores, measure: str) -> Comparison:
 
 def _race(facts: Judged, own: Scores, reference: Scores) -> Judged:
     return {**facts, **asdict(compare_hitting_times(*paired(own.by_seed, reference.by_seed)))}
-
-
-def _controlled(t: int, successes: Mapping[str, float], own: Scores, reference: Scores) -> Judged:
-    return {
-        "t": t,
-        "success": successes[own.label],
-        "success_reference": successes[reference.label],
-        **asdict(_against(own, reference, f"control/{t}")),
-        "n_lost": without_ratio(*paired(own.by_seed, reference.by_seed)),
-    }
 
 
 def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFrame:

@@ -17,10 +17,9 @@ from analysis.data.matching import AnalysisError, IncompleteError
 from analysis.data.samples import learned_model, sample_losses, simulated_trial
 from analysis.data.selection import Entry, Gap, Selection
 from analysis.stats.curves import STUDENT_RANGE, PlotOptions
-from analysis.stats.scores import Measure, control_part, geometric_mean
+from analysis.stats.scores import Measure, geometric_mean
 from analysis.style import (
     but_diverged,
-    but_lost,
     number,
     p_text,
     plus_minus,
@@ -31,7 +30,6 @@ from analysis.style import (
 from analysis.tables.comparisons import (
     EPSILON_POLICY,
     aggregate,
-    compare_control,
     compare_policies,
     compare_steps,
     summarise,
@@ -143,9 +141,7 @@ def ratio_text(prefix: str = "") -> Text:
     return lambda row: within(*(row[f"{prefix}{name}"] for name in ("ratio", "low", "high")))
 
 
-def _paired(
-    table: pd.DataFrame, better: str, test: str, own: Columns, first: Columns = ()
-) -> Columns:
+def _paired(table: pd.DataFrame, better: str, test: str, own: Columns) -> Columns:
     """Return the columns that all paired comparisons have around their own ones.
 
     The last ones are the share of seeds on which the variant is better, p, adjusted p, and the
@@ -153,7 +149,6 @@ def _paired(
     """
     return (
         ("env", itemgetter("env")),
-        *first,
         ("variant", itemgetter("variant")),
         (_reference(table), itemgetter("reference")),
         *own,
@@ -218,28 +213,6 @@ def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
         "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
         "stratified by system. Compare only rows of the same systems. "
         f"Diverged trials: {rule}."
-    )
-    return rendered(table, columns, note)
-
-
-def control_table(table: pd.DataFrame) -> TextTable:
-    """Return the paired comparison of the costs of control, with the shares of successes."""
-    own: Columns = (
-        ("success", text_of("success", share)),
-        ("success of reference", text_of("success_reference", share)),
-        ("cost ratio [95 %]", lambda row: but_lost(ratio_text()(row), row["n_lost"])),
-    )
-    steps = [("explored steps", itemgetter("t"))]
-    columns = _paired(table, "improvement", "Wilcoxon", own, steps)
-    note = (
-        "Success: share of the episodes of the variant and of the reference that succeed, planned "
-        f"by the model learned so far. Cost ratio: {_RATIO}; geometric mean over seeds of the "
-        "episode's cost; interval: paired BCa bootstrap of the log ratio, "
-        f"{STUDENT_RANGE} pairs. P(improvement): share of seeds with the "
-        f"lower cost, ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, "
-        f"{_TESTED}. Lost: pairs in no ratio, as one of the two episodes or the true model's has "
-        "no finite cost; a lost episode counts as the worst in P(improvement) and p, one "
-        "whose true model's was lost in neither. Trials that diverged before a step are left out."
     )
     return rendered(table, columns, note)
 
@@ -348,12 +321,6 @@ def _raced(selection: Selection, options: PlotOptions) -> Selection:
     )
 
 
-def _controlled(selection: Selection, _: PlotOptions) -> Selection:
-    """Return the environments with a task in which the reference and a variant were assessed."""
-    controlled = control_part(selection).compared()
-    return controlled if len(controlled.labels) > 1 else Selection(())
-
-
 TABLES = {
     "summary": TableKind(
         "Final losses",
@@ -371,12 +338,6 @@ TABLES = {
     "comparison_auc": comparison("loss", Measure.AUC),
     "comparison_steps": comparison("loss", Measure.STEPS),
     "comparison_reachable": comparison("reachable_loss", Measure.FINAL),
-    "comparison_control": TableKind(
-        "Cost of control against the reference",
-        _controlled,
-        lambda reader, selection, _: compare_control(reader, selection),
-        lambda table, _: control_table(table),
-    ),
 }
 
 
