@@ -38,7 +38,6 @@ from analysis.tables.rendering import (
     sample_loss_kind,
 )
 from dopt.errors import install_command
-from dopt.process import usable_cores
 from dopt.result import Assessment
 from orchestrate.program import Parser, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, Store, default_url
@@ -87,13 +86,6 @@ def parser() -> Parser:
         "--style", choices=list(Spread), default=Spread.BAND, help="intervals of figure 1"
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
-    cores = usable_cores()
-    figures.add_argument(
-        "--workers",
-        type=positive("--workers", int),
-        default=cores,
-        help="outputs at a time (one for each core)",
-    )
     summary = _command(commands, "summary", _table, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _table, "every variant against the reference, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
@@ -237,7 +229,6 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
     for outcome in build(
         *(reader, selection, _plot_options(options), options.out, tuple(options.only or NAMES)),
         force=options.force,
-        workers=options.workers,
     ):
         say(f"{options.out / outcome.name}: {outcome.state}")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
