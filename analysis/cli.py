@@ -20,7 +20,6 @@ import pandas as pd
 
 from analysis import log_report, report
 from analysis.data.matching import REFERENCE, AnalysisError, Filter, IncompleteError, read_condition
-from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
@@ -95,8 +94,8 @@ def parser() -> Parser:
     aggregate = _command(
         commands, "aggregate", _table, "every variant against the reference, over all systems"
     )
-    calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP, diverged=False)
-    sampled = _command(commands, "sample-loss", _table, SAMPLE_LOSS_HELP, diverged=False)
+    calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP)
+    sampled = _command(commands, "sample-loss", _table, SAMPLE_LOSS_HELP)
     sampled.add_argument("--store", action="store_true", help="keep what is fitted in the database")
     tables = {
         summary: lambda _: TABLES["summary"],
@@ -159,20 +158,11 @@ def _command(
     name: str,
     run: object,
     help_text: str,
-    *,
-    diverged: bool = True,
 ) -> Parser:
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run)
     add_database(command)
     add_selection(command)
-    if diverged:
-        command.add_argument(
-            "--diverged",
-            choices=list(DivergenceRule),
-            default=DivergenceRule.EXCLUDE,
-            help="what a diverged trial counts as",
-        )
     return command
 
 
@@ -211,7 +201,7 @@ def wanted(options: argparse.Namespace) -> Filter:
 
 def _plot_options(options: argparse.Namespace) -> PlotOptions:
     """Return what a command was asked to show; options that it lacks are as usual."""
-    names = {"rule": "diverged", "axis": "x", "spread": "style"}
+    names = {"axis": "x", "spread": "style"}
     found: dict[str, Any] = {}
     for field in dataclasses.fields(PlotOptions):
         name = names.get(field.name, field.name)
@@ -258,11 +248,11 @@ def _animate(options: argparse.Namespace) -> int:
 
 def _table(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     """Print the table of a command."""
-    kind, plot_options, form = options.table(options), _plot_options(options), options.format
-    table = kind.measure(reader, selection, plot_options)
+    kind, form = options.table(options), options.format
+    table = kind.measure(reader, selection, _plot_options(options))
     if selection.gaps:
         tell(sys.stderr, f"{partial_warning(selection)}\n")
-    tell(sys.stdout, _text(kind.render(table, plot_options), table, form), exact=form == "csv")
+    tell(sys.stdout, _text(kind.render(table), table, form), exact=form == "csv")
     return 0
 
 

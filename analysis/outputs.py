@@ -143,7 +143,7 @@ def _tabulate(
 ) -> dict[str, str]:
     kind = TABLES[name]
     table = kind.measure(reader, selection, options)
-    text_table = kind.render(table, options)
+    text_table = kind.render(table)
     warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
     write_table(table, folder, name)
     write_text(warning + text_table.markdown(), folder / f"{name}.md")

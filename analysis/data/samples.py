@@ -1,4 +1,4 @@
-"""Numbers of trials: curves, rules for diverged ones, learned models; frames for a notebook.
+"""Numbers of trials: curves, learned models; frames for a notebook.
 
 import analysis
 
@@ -16,7 +16,6 @@ import json
 import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from typing import Any, Self
 
 import numpy as np
@@ -49,30 +48,17 @@ from orchestrate.store import (
 from orchestrate.store.records import stacked
 
 Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
-
-class DivergenceRule(StrEnum):
-    """How diverged trials enter a statistic.
-
-    ``EXCLUDE`` leaves them out, from the first step to the last; ``WORST`` and ``MEDIAN`` give them
-    at each step the largest and the median loss of the trials that did not diverge.
-    """
-
-    EXCLUDE = "exclude"
-    WORST = "worst"
-    MEDIAN = "median"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Curves that enter a statistic.
+    """Curves that enter a statistic: of the trials that did not diverge.
 
     Attributes
     ----------
     seeds : (n,)
     values : (n, T)
-        Finite, after the rule was applied.
+        Finite.
     n_finished : int
         Trials that ran to an end, diverged ones included.
     n_diverged : int
@@ -88,22 +74,6 @@ class Sample:
         return of_finished(len(self.values), self.n_finished, self.n_diverged)
 
 
-def apply_rule(
-    seeds: npt.NDArray[np.int64], values: Array, diverged: Mask, rule: DivergenceRule
-) -> Sample:
-    """Return the sample (n, T) that a statistic sees, of trials (N, T) with NaN past divergence.
-
-    Without a trial that survived, ``WORST`` and ``MEDIAN`` have nothing to lend and the sample is
-    empty.
-    """
-    kept = values[~diverged]
-    if rule is DivergenceRule.EXCLUDE or not len(kept) or not diverged.any():
-        return Sample(seeds[~diverged], kept, len(values), int(diverged.sum()))
-    lent = np.max(kept, axis=0) if rule is DivergenceRule.WORST else np.median(kept, axis=0)
-    filled = np.where(diverged[:, None], lent, values)
-    return Sample(seeds, filled, len(values), int(diverged.sum()))
-
-
 def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     """Return one column of the entry's finished trials.
 
@@ -117,10 +87,11 @@ def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     return Curves(curves.seeds[kept], curves.t[:n], curves.values[kept, :n], curves.diverged[kept])
 
 
-def read_sample(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Sample:
-    """Return the curves (n, T) that a statistic sees."""
+def read_sample(reader: Reader, entry: Entry, column: str) -> Sample:
+    """Return the curves (n, T) that a statistic sees: a diverged trial leaves its whole curve."""
     curves = read_curves(reader, entry, column)
-    return apply_rule(curves.seeds, curves.values, curves.diverged, rule)
+    lost = curves.diverged
+    return Sample(curves.seeds[~lost], curves.values[~lost], len(lost), int(lost.sum()))
 
 
 def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array]:

@@ -13,7 +13,6 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from analysis.data.samples import DivergenceRule
 from analysis.data.selection import policy_rank, why_impossible
 from analysis.figures.panels import (
     Plot,
@@ -188,7 +187,7 @@ def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> lis
 
 
 def caption(numbers: Numbers) -> str:
-    """Return the caption, with the statistic, the band, n and the rule for diverged trials."""
+    """Return the caption, with the statistic, the band, n and what becomes of diverged trials."""
     column, options, curves = numbers
     counts = [
         f"{environment_title(env)} "
@@ -197,16 +196,11 @@ def caption(numbers: Numbers) -> str:
     ]
     envs = dict.fromkeys(curve.env for curve in curves)
     absent = [f" No line: {why}." for env in envs for why in _absent(curves, env).values()]
-    rules = {
-        DivergenceRule.EXCLUDE: "A diverged trial leaves its whole curve.",
-        DivergenceRule.WORST: "A diverged trial counts with the worst loss of each step.",
-        DivergenceRule.MEDIAN: "A diverged trial counts with the median loss of each step.",
-    }
     return (
         f"{_what(column, curves)} against time t, one panel per environment. "
         f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
         f"{options.interval}; no smoothing. {_breaks(curves)}"
-        f"{rules[options.rule]} Policies of one environment share initial "
+        f"A diverged trial leaves its whole curve. Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from analysis.data.matching import APART
-from analysis.data.samples import DivergenceRule, read_sample
+from analysis.data.samples import read_sample
 from analysis.data.selection import (
     Entry,
     Selection,
@@ -68,12 +68,6 @@ PANEL_HEIGHT = 3.2
 LEGEND_ROW = 0.16
 LEGEND_COLUMNS = 3
 
-_RULES = {
-    DivergenceRule.EXCLUDE: "in none of its numbers",
-    DivergenceRule.WORST: "with the worst final loss of the others",
-    DivergenceRule.MEDIAN: "with the median final loss of the others",
-}
-
 
 def pareto_part(selection: Selection) -> Selection:
     """Return all configurations of the environments that have several, without the oracle's."""
@@ -90,7 +84,7 @@ def pareto_part(selection: Selection) -> Selection:
     return Selection(entries, notes=tuple(unfinished(entries)))
 
 
-def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -> pd.DataFrame:
+def measure_points(reader: Reader, selection: Selection) -> pd.DataFrame:
     """Return a row for each configuration of an environment, ordered by time within it.
 
     ``label``: settings that differ among the configurations of the environment; ``policy_label``
@@ -107,7 +101,7 @@ def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -
     learners = learner_words(selection.entries)
     rows = []
     for entry, learner in zip(selection.entries, learners, strict=True):
-        scores = final_losses(reader, entry, "loss", rule)
+        scores = final_losses(reader, entry, "loss")
         system, loss = system_of(entry.config.config), geometric_mean(scores.values)
         row: dict[str, Any] = {
             "env": entry.config.env,
@@ -165,10 +159,7 @@ def step_us(reader: Reader, entry: Entry) -> float:
     The mean over the steps of a trial counts what is done in some of them only, such as the fit of
     every tenth step; the median over trials leaves out those that the machine held up.
     """
-    plan, learn = (
-        read_sample(reader, entry, column, DivergenceRule.EXCLUDE).values
-        for column in ("plan_us", "learn_us")
-    )
+    plan, learn = (read_sample(reader, entry, column).values for column in ("plan_us", "learn_us"))
     return float(np.median(np.mean(plan + learn, axis=1))) if len(plan) else float("nan")
 
 
@@ -181,9 +172,6 @@ def policies_of(points: pd.DataFrame) -> dict[str, str]:
 def tabulate_points(points: pd.DataFrame) -> pd.DataFrame:
     """Return what is drawn, one row for each environment and configuration."""
     return points.drop(columns=["unit", "counts", "limit_us", "known"])
-
-
-Numbers = tuple[DivergenceRule, pd.DataFrame]
 
 
 def draw(points: pd.DataFrame) -> Figure:
@@ -274,9 +262,8 @@ def _handles(
     return [*handles, Line2D([], [], color=BLACK, lw=0.7, label="Pareto front")]
 
 
-def caption(numbers: Numbers) -> str:
+def caption(points: pd.DataFrame) -> str:
     """Return the caption, with what a point is, n and the configurations without a point."""
-    rule, points = numbers
     counts = "; ".join(
         f"{environment_title(str(env))}: {_counts(part)}"
         for env, part in points.groupby("env", sort=False)
@@ -289,7 +276,7 @@ def caption(numbers: Numbers) -> str:
         "trials). Time: mean over the steps of a trial, median over trials. Line: Pareto front; "
         "no configuration is both as good and as fast as one on it, and better in one of the two. "
         "Dashed, where it is in range: the time between two steps, dt. Open markers: some "
-        f"trials diverged; a diverged trial counts {_RULES[rule]}. {_missing(points)}"
+        f"trials diverged; a diverged trial counts in none of its numbers. {_missing(points)}"
         f"Trials: {counts}."
     )
 
@@ -308,18 +295,15 @@ def _missing(points: pd.DataFrame) -> str:
     return f"No point, as no trial has a positive final loss: {lost}. " if lost else ""
 
 
-PARETO: Plot[Numbers] = Plot(
+PARETO: Plot[pd.DataFrame] = Plot(
     title="Final loss against the time of a step",
     statistic="geometric mean over trials of the final loss; median over trials of the mean "
     "microseconds of planning and learning in a step",
     band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
     part=lambda selection, _: pareto_part(selection),
-    measure=lambda reader, selection, options: (
-        options.rule,
-        measure_points(reader, selection, options.rule),
-    ),
-    tabulate=lambda numbers: tabulate_points(numbers[1]),
-    draw=lambda numbers: draw(numbers[1]),
+    measure=lambda reader, selection, _: measure_points(reader, selection),
+    tabulate=tabulate_points,
+    draw=draw,
     caption=caption,
 )
 """Final loss against the time of a step, with the Pareto front."""

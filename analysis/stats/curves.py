@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import check_keys, setting_value
-from analysis.data.samples import DivergenceRule, Sample, read_sample
+from analysis.data.samples import Sample, read_sample
 from analysis.data.selection import Entry, Selection
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
 from dopt.assessment import TURN, Plane, turns, wrap
@@ -296,7 +296,6 @@ class PlotOptions:
     each, belong to the loss curves.
     """
 
-    rule: DivergenceRule = DivergenceRule.EXCLUDE
     axis: Axis = Axis.STEPS
     statistic: Statistic = Statistic.MEAN
     spread: Spread = Spread.BAND
@@ -424,7 +423,7 @@ def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, 
 def _curve(
     reader: Reader, entry: Entry, style: LineStyle, column: str, options: PlotOptions
 ) -> LossCurve:
-    config, sample = entry.config, read_sample(reader, entry, column, options.rule)
+    config, sample = entry.config, read_sample(reader, entry, column)
     t = np.arange(sample.values.shape[1])
     system = system_of(config.config)
     return LossCurve(

@@ -164,7 +164,7 @@ def sample_loss_columns(stored: bool) -> Columns:
     return [("sample loss", mean_text("sample_loss"))] if stored else []
 
 
-def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
+def summary_table(table: pd.DataFrame) -> TextTable:
     """Return the table of final losses: mean ± 2 SE, median, IQM and n."""
     columns: Columns = (
         ("env", itemgetter("env")),
@@ -179,14 +179,14 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
     )
     note = (
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
-        f"Diverged trials: {rule}."
+        "Diverged trials: exclude."
     )
     if "sample_loss" in table:
         note += " Sample loss: mean over the trials of which one is stored (analysis sample-loss)."
     return rendered(table, columns, note)
 
 
-def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.FINAL) -> TextTable:
+def comparison_table(table: pd.DataFrame, measure: Measure = Measure.FINAL) -> TextTable:
     """Return the paired comparison of losses."""
     columns = _paired(table, "improvement", "Wilcoxon", [("loss ratio [95 %]", ratio_text())])
     note = (
@@ -194,12 +194,12 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
         f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
         "pairs. P(improvement): share of seeds with the lower loss, ties half. "
         f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
-        f"Diverged trials: {rule}."
+        "Diverged trials: exclude."
     )
     return rendered(table, columns, note)
 
 
-def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
+def aggregate_table(table: pd.DataFrame) -> TextTable:
     """Return the comparison over all systems."""
     columns: Columns = (
         ("variant", itemgetter("variant")),
@@ -211,13 +211,12 @@ def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
     note = (
         f"Ratio: {_RATIO}; geometric mean over systems, each counted alike, of the geometric mean "
         "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
-        "stratified by system. Compare only rows of the same systems. "
-        f"Diverged trials: {rule}."
+        "stratified by system. Compare only rows of the same systems. Diverged trials: exclude."
     )
     return rendered(table, columns, note)
 
 
-def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
+def hitting_times_table(table: pd.DataFrame) -> TextTable:
     """Return the paired comparison of the steps to a loss."""
     own: Columns = (
         ("ε", text_of("epsilon", number)),
@@ -233,7 +232,7 @@ def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
         "final loss of random inputs unless --epsilon says otherwise. A trial that never gets "
         "there is censored at the horizon: later than any that does, a tie with another such. "
         "P(earlier): share of seeds on which the variant is earlier, "
-        f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: {rule}."
+        f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: exclude."
     )
     return rendered(table, columns, note)
 
@@ -274,7 +273,7 @@ class TableKind:
     title: str
     part: Callable[[Selection, PlotOptions], Selection]
     measure: Callable[[Reader, Selection, PlotOptions], pd.DataFrame]
-    render: Callable[[pd.DataFrame, PlotOptions], TextTable]
+    render: Callable[[pd.DataFrame], TextTable]
 
 
 def comparison(column: str, measure: Measure) -> TableKind:
@@ -285,18 +284,16 @@ def comparison(column: str, measure: Measure) -> TableKind:
             f"Steps to a loss, {where}",
             _raced,
             lambda reader, selection, options: compare_steps(
-                reader, selection, column, options.rule, options.epsilon
+                reader, selection, column, options.epsilon
             ),
-            lambda table, options: hitting_times_table(table, options.rule),
+            hitting_times_table,
         )
     title = "Final loss" if measure is Measure.FINAL else "Loss over the whole curve"
     return TableKind(
         f"{title} against the reference, {where}",
         _compared,
-        lambda reader, selection, options: compare_policies(
-            reader, selection, column, options.rule, measure
-        ),
-        lambda table, options: comparison_table(table, options.rule, measure),
+        lambda reader, selection, _: compare_policies(reader, selection, column, measure),
+        lambda table: comparison_table(table, measure),
     )
 
 
@@ -325,14 +322,14 @@ TABLES = {
     "summary": TableKind(
         "Final losses",
         _whole,
-        lambda reader, selection, options: summarise(reader, selection, options.rule),
-        lambda table, options: summary_table(table, options.rule),
+        lambda reader, selection, _: summarise(reader, selection),
+        summary_table,
     ),
     "aggregate": TableKind(
         "Final loss against the reference, all systems",
         _compared,
-        lambda reader, selection, options: aggregate(reader, selection, options.rule),
-        lambda table, options: aggregate_table(table, options.rule),
+        lambda reader, selection, _: aggregate(reader, selection),
+        aggregate_table,
     ),
     "comparison": comparison("loss", Measure.FINAL),
     "comparison_auc": comparison("loss", Measure.AUC),
@@ -411,7 +408,7 @@ CALIBRATION = TableKind(
     "Fit at held-out states",
     _whole,
     lambda reader, selection, _: measure_calibration(reader, selection),
-    lambda table, _: calibration_table(table),
+    calibration_table,
 )
 
 
@@ -508,7 +505,7 @@ def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
         "Final losses beside sample losses",
         _whole,
         lambda reader, selection, _: measure_sample_losses(reader, selection, say, keep),
-        lambda table, _: rendered(table, columns, SAMPLE_LOSS_NOTE),
+        lambda table: rendered(table, columns, SAMPLE_LOSS_NOTE),
     )
 
 

@@ -324,6 +324,7 @@ def test_a_wrong_request_is_one_sentence(
         (["summary", "--formt", "csv"], "'--formt' is unknown.* did you mean '--format'"),
         (["summary", "--format", "cvs"], "--format 'cvs' is unknown.* did you mean 'csv'"),
         (["summary", "--db"], "--db: expected one argument: see python -m analysis summary --help"),
+        (["compare", "--diverged", "worst"], "'analysis --diverged' was removed: analysis.load"),
         (["figures", "--workers", "2"], "'analysis --workers' was removed: one process draws"),
         (["figures", "--only", "comparison_control"], "was removed: python -m analysis report"),
         (["floor", "--env", "arm"], "'analysis floor' was removed: .*dopt.fit_offline"),

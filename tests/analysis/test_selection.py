@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,7 +25,6 @@ from analysis.data.matching import (
     difference,
     newest,
 )
-from analysis.data.samples import DivergenceRule, apply_rule
 from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, select
 from analysis.tables.comparisons import compare_policies, references
 from dopt import registry
@@ -483,39 +481,3 @@ def test_figure_1_is_coloured_by_the_setting(bounds_url: str, tmp_path: Path) ->
     table = (tmp_path / "figure1.csv").read_text().splitlines()
     assert {line.split(",")[2] for line in table[1:]} == {'"D-optimal', '"random'}
     assert "| random, γ=10 |" in " ".join((tmp_path / "summary.md").read_text().split())
-
-
-NAN = np.nan
-SEEDS = np.array([0, 1, 2, 3])
-VALUES = np.array([[4.0, 2.0], [6.0, 8.0], [5.0, NAN], [5.0, 5.0]])
-DIVERGED = np.array([False, False, True, False])
-
-
-def test_a_diverged_trial_leaves_its_whole_curve() -> None:
-    sample = apply_rule(SEEDS, VALUES, DIVERGED, DivergenceRule.EXCLUDE)
-    assert sample.seeds.tolist() == [0, 1, 3]
-    assert sample.values.tolist() == [[4, 2], [6, 8], [5, 5]]
-    assert sample.describe() == "3/4, 1 diverged"
-
-
-@pytest.mark.parametrize(
-    ("rule", "lent"), [(DivergenceRule.WORST, [6, 8]), (DivergenceRule.MEDIAN, [5, 5])]
-)
-def test_the_others_lend_a_value_at_every_step(rule: DivergenceRule, lent: list[float]) -> None:
-    sample = apply_rule(SEEDS, VALUES, DIVERGED, rule)
-    assert sample.values[2].tolist() == lent
-    assert np.array_equal(sample.values[[0, 1, 3]], VALUES[[0, 1, 3]])
-    assert sample.n_diverged == 1
-
-
-@pytest.mark.parametrize("rule", list(DivergenceRule))
-def test_without_survivors_the_sample_is_empty(rule: DivergenceRule) -> None:
-    sample = apply_rule(SEEDS, VALUES, np.full(4, True), rule)
-    assert sample.values.shape == (0, 2)
-    assert sample.describe() == "0/4, 4 diverged"
-
-
-def test_without_divergence_the_count_is_a_number() -> None:
-    kept = ~DIVERGED
-    sample = apply_rule(SEEDS[kept], VALUES[kept], DIVERGED[kept], DivergenceRule.WORST)
-    assert sample.describe() == "3"

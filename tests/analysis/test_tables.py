@@ -17,7 +17,6 @@ from hypothesis.extra.numpy import arrays
 import analysis
 from analysis.cli import main
 from analysis.data.matching import AnalysisError, Filter
-from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
 from analysis.figures.phase_portraits import measure_spectra, spectrum_caption
 from analysis.report import CAPTION, EXPLAINED
@@ -77,15 +76,12 @@ def test_summary_follows_from_the_trials(reader: Reader) -> None:
     assert row.n == 5
 
 
-def test_a_diverged_trial_is_left_out_counted_or_the_worst(reader: Reader) -> None:
+def test_a_diverged_trial_is_left_out_and_counted(reader: Reader) -> None:
     selection = select(reader, Filter(("cartpole",), ("random",)))
     losses = [final("cartpole", "random", seed) for seed in SEEDS if seed != 2]
     left_out = summarise(reader, selection).iloc[0]
     assert (left_out.n, left_out.n_diverged) == (4, 1)
     assert left_out.loss == pytest.approx(np.mean(losses))
-    worst = summarise(reader, selection, DivergenceRule.WORST).iloc[0]
-    assert worst.n == 5
-    assert worst.loss == pytest.approx(np.mean([*losses, max(losses)]))
 
 
 def test_comparison_pairs_the_seeds(reader: Reader) -> None:
@@ -168,8 +164,8 @@ def test_markdown_shows_counts_and_dashes() -> None:
         **nothing,
     }
     table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
-    assert "Student's below 30 and above 2000 pairs" in comparison_table(table, "exclude").note
-    line = comparison_table(table, "exclude").markdown().splitlines()[2]
+    assert "Student's below 30 and above 2000 pairs" in comparison_table(table).note
+    line = comparison_table(table).markdown().splitlines()[2]
     assert [field.strip() for field in line.strip("|").split("|")] == [
         "arm", "random", "D-optimal", "–", "–", "–", "–", "0, 3 diverged",
     ]  # fmt: skip
@@ -179,15 +175,15 @@ def test_markdown_shows_counts_and_dashes() -> None:
         for part, value in (("", 1.0), ("_2se", 0.1), ("_median", 0.9), ("_iqm", 0.95))
     }
     counts = {"env": "arm", "policy": "random", "label": "random", "n": 98, "n_diverged": 2}
-    summary = summary_table(pd.DataFrame([counts | values]), "worst").markdown()
+    summary = summary_table(pd.DataFrame([counts | values])).markdown()
     assert "1.00 ± 0.10" in summary
-    assert "Diverged trials: worst." in summary
+    assert "Diverged trials: exclude." in summary
 
 
 def test_every_caption_says_what_is_divided_by_what() -> None:
     for note in (
-        comparison_table(pd.DataFrame(), "exclude").note,
-        comparison_table(pd.DataFrame(), "exclude", Measure.AUC).note,
+        comparison_table(pd.DataFrame()).note,
+        comparison_table(pd.DataFrame(), Measure.AUC).note,
     ):
         assert "atio: variant / reference, below 1 the variant is better" in note
     explained = " ".join(EXPLAINED)
