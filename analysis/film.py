@@ -17,7 +17,7 @@ from matplotlib.ticker import MultipleLocator
 from analysis.data.matching import AnalysisError
 from analysis.data.samples import simulated_trial
 from analysis.data.selection import Entry
-from analysis.figures.loss_curves import loss_label
+from analysis.figures.losses import loss_label
 from analysis.figures.panels import angle_ticks, log_ticks, mathematical, styled
 from analysis.stats.curves import DrawnPlane, log_limits
 from analysis.style import BLACK, GREY, environment_title, loss_unit, policy_style, unit_of

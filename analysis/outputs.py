@@ -34,12 +34,12 @@ PACKAGE = Path(__file__).parent
 """The folder of the analysis."""
 
 _PLOTS = {
-    "figure1": ("loss_curves", "loss_plot", "loss"),
-    "figure1_reachable": ("loss_curves", "loss_plot", "reachable_loss"),
+    "figure1": ("losses", "loss_plot", "loss"),
+    "figure1_reachable": ("losses", "loss_plot", "reachable_loss"),
     "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
     "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
     "figure2_spectrum": ("phase_portraits", "spectrum_plot", "cartpole"),
-    "figure6_pareto": ("pareto", "PARETO"),
+    "figure6_pareto": ("losses", "PARETO"),
 }
 """Module, name and subject of each figure, in the order of the page."""
 

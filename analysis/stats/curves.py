@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import check_keys, setting_value
+from analysis.data.matching import setting_value
 from analysis.data.samples import Sample, read_sample
 from analysis.data.selection import Entry, Selection
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
@@ -292,15 +292,13 @@ class Spread(StrEnum):
 class PlotOptions:
     """Options of the plots; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
-    ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
-    each, belong to the loss curves.
+    ``axis``, ``statistic`` and ``spread`` belong to the loss curves.
     """
 
     axis: Axis = Axis.STEPS
     statistic: Statistic = Statistic.MEAN
     spread: Spread = Spread.BAND
     epsilon: float | None = None
-    color_by: str | None = None
 
     @property
     def interval(self) -> str:
@@ -390,19 +388,19 @@ def measure_curves(
     reader: Reader, selection: Selection, column: str, options: PlotOptions
 ) -> tuple[LossCurve, ...]:
     """Return a curve for each entry of the selection, in its order."""
-    styles = line_styles(selection, options.color_by)
+    styles = line_styles(selection)
     return tuple(
         _curve(reader, entry, styles[entry.label], column, options) for entry in selection.entries
     )
 
 
-def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, LineStyle]:
+def line_styles(selection: Selection) -> dict[str, LineStyle]:
     """Return the style of each label: of policies their own, of other settings by value.
 
-    Entries of one colour are told apart by their dashes.
+    The first setting of ``group_by`` decides about colours; entries of one colour are told apart
+    by their dashes.
     """
-    key = color_by or selection.group_by[0]
-    check_keys([key], [entry.config for entry in selection.entries])
+    key = selection.group_by[0]
     values = list(dict.fromkeys(repr(setting_value(e.config, key)) for e in selection.entries))
     used: Counter[str] = Counter()
     styles: dict[str, LineStyle] = {}

@@ -14,7 +14,7 @@ import pytest
 from analysis.cli import main
 from analysis.data.matching import Filter
 from analysis.data.selection import select
-from analysis.figures.pareto import (
+from analysis.figures.losses import (
     PARETO,
     draw,
     measure_points,

@@ -18,7 +18,7 @@ from analysis import outputs
 from analysis.cli import main, parser
 from analysis.data.matching import Filter
 from analysis.data.selection import Selection, select
-from analysis.figures.loss_curves import _title, loss_plot
+from analysis.figures.losses import _title, loss_plot
 from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot, spectrum_plot
 from analysis.outputs import FIGURES, NAMES, build, plots
 from analysis.stats.curves import PlotOptions

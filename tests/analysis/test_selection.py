@@ -475,7 +475,7 @@ def test_a_setting_that_nothing_has_is_a_sentence(bounds: Reader) -> None:
 
 
 def test_figure_1_is_coloured_by_the_setting(bounds_url: str, tmp_path: Path) -> None:
-    grouped = ["--group-by", "policy", "env.gamma", "--color-by", "env.gamma"]
+    grouped = ["--group-by", "env.gamma", "policy"]
     only = ["--only", "figure1", "--only", "summary", "--out", str(tmp_path)]
     assert main(["figures", "--db", bounds_url, *only, *grouped]) == 0
     table = (tmp_path / "figure1.csv").read_text().splitlines()

@@ -24,13 +24,11 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 from playwright.sync_api import Browser, expect
-from starlette.routing import Route
 
 from analysis.cli import main
 from analysis.serve import app as serving
 from analysis.serve import web
-from analysis.serve.app import create_app
-from analysis.serve.web import Cache, Database, Events, loss_text, plain, read_progress
+from analysis.serve.web import Cache, Database, Events, plain, read_progress
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
@@ -48,13 +46,12 @@ def taken() -> Iterator[int]:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--port", "99999"], "expected is a number of 0 to 65535"),
+        (["--port", "99999"], "port must be 0-65535"),
         (["--port", "many"], "invalid int value: 'many'"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
         (["--host", "no.such.host.invalid"], "cannot listen at no.such.host.invalid"),
         (["--db", "nothing"], "The database URL cannot be read"),
         (["--where", "model.width=3"], "--where"),
-        (["--db", "sqlite:///a.db", "sqlite:///b.db"], "orchestrate merge"),
         (["--figures", "figures"], "open README.md"),
     ],
 )
@@ -97,13 +94,6 @@ def test_a_kept_value_is_not_computed_again_until_it_is_forgotten() -> None:
 def test_numbers_that_are_not_finite_are_null() -> None:
     found = plain({"a": [float("nan"), float("inf"), 1.5], "b": (True, None, Path("x"))})
     assert found == {"a": [None, None, 1.5], "b": [True, None, "x"]}
-
-
-def test_small_losses_are_written_with_a_power_of_ten() -> None:
-    assert loss_text(0.804, 0.112) == "0.80 ± 0.11"
-    assert loss_text(3.449e-4, 3.86e-5) == "(3.45 ± 0.39) · 10⁻⁴"
-    assert loss_text(float("nan"), None) == "–"
-    assert loss_text(1.5, float("nan")) == "1.50"
 
 
 HALF = b"GET / HTTP/1.1\r\nHost: 127"
@@ -210,32 +200,6 @@ def test_strangers_cannot_fill_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [passed(3, logging.ERROR), passed(3, logging.ERROR)] == [True, True]
     monkeypatch.setattr(serving, "LOG_SECONDS", -1.0)
     assert [passed(4), passed(4)] == [True, True]
-
-
-def test_a_page_that_never_ends_does_not_keep_the_server(
-    sqlite_grid: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(serving, "END_SECONDS", 0.5)
-    left, asked = threading.Event(), threading.Event()
-
-    def stuck(_: object) -> None:
-        asked.set()
-        assert left.wait(PATIENCE_SECONDS)
-
-    pages = create_app(sqlite_grid)
-    pages.routes.insert(0, Route("/stuck", stuck))
-    server = serving.Server(pages, 0, leave=left.set)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    until(lambda: server.started)
-    port = server.servers[0].sockets[0].getsockname()[1]
-    address = f"http://127.0.0.1:{port}"
-    with connected(address, request(address, "/stuck")):
-        assert asked.wait(PATIENCE_SECONDS)
-        server.should_exit = True
-        assert left.wait(PATIENCE_SECONDS)
-        thread.join(PATIENCE_SECONDS)
-    assert not thread.is_alive()
 
 
 T = TypeVar("T")
