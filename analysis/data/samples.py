@@ -6,7 +6,7 @@ results = analysis.load(env="pendulum")
 results.trials()                       # one row for each trial
 results.curves("loss")                 # one row for each trial and step
 results.matrix("pendulum", "random")   # losses (seed, t)
-results.assessments("control_cost")    # one row for each trial and assessed step
+results.reader.query("SELECT * FROM v_assessment")   # rows of any SELECT
 results.model(trial).predict(states)   # learned accelerations (N, r) of a row of trials()
 """
 
@@ -39,7 +39,6 @@ from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
 from orchestrate.store import (
     CONFIG_COLUMNS,
-    Assessments,
     ConfigRow,
     Curves,
     Reader,
@@ -232,7 +231,6 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
 
 
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
-_MEASURED = ("seed", "t", "measure", "value", "diverged")
 
 
 def read_request(env: object, policy: object, where: object) -> Filter:
@@ -392,30 +390,13 @@ class Results:
     def _tidy(self, config: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
         with self.reader.moment() as moment:
             read = {name: moment.curves(config.config_key, name) for name in columns}
+        first = next(iter(read.values()))
+        n, steps = first.values.shape
+        frame = pd.DataFrame({"seed": np.repeat(first.seeds, steps), "t": np.tile(first.t, n)})
+        frame["time"] = config.dt * frame["t"]
+        frame["diverged"] = np.repeat(first.diverged, steps)
         values = {name: column.values.ravel() for name, column in read.items()}
-        frame = _long(next(iter(read.values())))
-        frame.insert(2, "time", config.dt * frame["t"])
         return _labelled(frame.assign(**values), config)
-
-    def assessments(self, *measures: str) -> pd.DataFrame:
-        """Return one row for each finished trial, measure and number of explored steps ``t``.
-
-        By default of all measures; empty where no trial was assessed. A value that overflowed, or
-        lies past a divergence, is NaN.
-        """
-        parts = [
-            self._measured(config, measure)
-            for config in self._configs()
-            for measure in (measures or self.reader.measures(config.config_key))
-        ]
-        if not parts:
-            return pd.DataFrame(columns=[*CONFIG_COLUMNS, "config_key", *_MEASURED])
-        return pd.concat(parts, ignore_index=True)
-
-    def _measured(self, config: ConfigRow, measure: str) -> pd.DataFrame:
-        found = self.reader.assessments(config.config_key, measure)
-        frame = _long(found).assign(measure=measure, value=found.values.ravel())
-        return _labelled(frame[list(_MEASURED)], config)
 
     def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
         """Return one column of the steps of a policy in an environment as a matrix (seed, t).
@@ -488,13 +469,6 @@ class Results:
                 f"it holds {len(configs)} in all: run the grid first, or ask for less."
             )
         return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
-
-
-def _long(found: Curves | Assessments) -> pd.DataFrame:
-    """Return a row for each trial and step: its seed, t and whether the trial diverged."""
-    n, steps = found.values.shape
-    columns = {"seed": np.repeat(found.seeds, steps), "t": np.tile(found.t, n)}
-    return pd.DataFrame({**columns, "diverged": np.repeat(found.diverged, steps)})
 
 
 def _labelled(frame: pd.DataFrame, config: ConfigRow) -> pd.DataFrame:

@@ -499,17 +499,6 @@ class DrawnPlane(Plane):
         return points
 
 
-@dataclass(frozen=True)
-class Spectrum:
-    """Mean over trials and the 10 % and 90 % quantiles across them, each (F,)."""
-
-    frequency: Array
-    mean: Array
-    low: Array
-    high: Array
-    n: int
-
-
 def periodogram(inputs: Array, dt: float) -> tuple[Array, Array]:
     """Return f [Hz] and S [unit² / Hz] of inputs (n, T, m) sampled every dt seconds.
 
@@ -524,11 +513,12 @@ def periodogram(inputs: Array, dt: float) -> tuple[Array, Array]:
     return np.asarray(frequency, dtype=float), np.asarray(density, dtype=float).sum(axis=2)
 
 
-def average_spectrum(inputs: Array, dt: float) -> Spectrum:
-    """Return mean and quantiles over trials of the periodograms of inputs (n, T, m)."""
+def average_spectrum(inputs: Array, dt: float) -> dict[str, Array]:
+    """Return columns of the periodograms of inputs (n, T, m): mean and quantiles over trials."""
     frequency, density = periodogram(inputs, dt)
     low, high = np.quantile(density, QUANTILES, axis=0)
-    return Spectrum(frequency, np.mean(density, axis=0), low, high, len(density))
+    columns = {"mean": np.mean(density, axis=0), "quantile_10": low, "quantile_90": high}
+    return {"frequency_hz": frequency, **columns}
 
 
 def median_seed(losses: dict[int, float]) -> int:

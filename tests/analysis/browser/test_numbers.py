@@ -329,15 +329,6 @@ def test_pages_hold_every_trial_once_in_order(
     assert "The list has 3 pages" in beyond
 
 
-def test_labels_tell_configurations_apart(
-    visit: Callable[..., TestClient], variants_grid: str
-) -> None:
-    found = visit(variants_grid).get("/api/trials?env=pendulum&policy=d_optimal&seed=0").json()
-    labels = {row["label"] for row in found["rows"]}
-    assert any("adam_replay" in label for label in labels)
-    assert any("γ=3" in label for label in labels)
-
-
 def test_filters_narrow_the_list(client: TestClient) -> None:
     found = client.get("/api/trials?env=cartpole&policy=random").json()
     assert (found["total"], len(found["rows"])) == (4, 4)

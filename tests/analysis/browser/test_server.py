@@ -223,23 +223,6 @@ def heard(address: str) -> Iterator[Iterator[tuple[str, Any]]]:
         )
 
 
-def test_a_change_is_an_event(url: str) -> None:
-    specs = make_grid(("pendulum",), ("random",), range(2), **grids.SHORT)
-    with (
-        Store.open(url) as store,
-        chromium.served(url) as address,
-        heard(address) as stream,
-    ):
-        assert next(stream)[1]["total"] == 0
-        launch = grids.begin(store)
-        store.register(launch, specs)
-        while (said := next(stream))[1]["total"] == 0:
-            pass
-        assert said[0] == "progress"
-        grids.finish(store, launch, specs[0])
-        assert next(stream)[1]["ended"] == 1
-
-
 def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
     with chromium.served(url) as address, heard(address) as stream:
@@ -250,14 +233,6 @@ def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path) -> None:
         shutil.move(tmp_path / "new.db", tmp_path / "results.db")
         name, content = next(stream)
         assert (name, content["total"]) == ("progress", 1)
-
-
-def test_an_open_stream_does_not_keep_the_server(sqlite_grid: str) -> None:
-    with ExitStack() as stack:
-        with chromium.served(sqlite_grid) as address:
-            stream = stack.enter_context(heard(address))
-            assert next(stream)[0] == "progress"
-        assert list(stream) == []
 
 
 def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
