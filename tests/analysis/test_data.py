@@ -280,13 +280,6 @@ def test_a_condition_tells_the_values_apart(stored: Reader) -> None:
         select(stored, Filter(where={PATH: "old"}))
 
 
-def test_the_condition_finds_trials_that_are_all_old(tmp_path: Path) -> None:
-    with filled(tmp_path, make_grid(("pendulum",), ("d_optimal",), range(2), **BRIEF)) as reader:
-        assert information(reader, **{PATH: "accumulated"}) == ["accumulated"]
-        with pytest.raises(AnalysisError, match='stored are "accumulated": choose'):
-            select(reader, Filter(where={PATH: "fresh"}))
-
-
 def test_the_values_are_grouped_and_compared(stored: Reader) -> None:
     selection = select(stored, Filter(group_by=(PATH,)))
     assert selection.labels == ("information=accumulated", "information=fresh")

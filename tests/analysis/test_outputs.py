@@ -10,7 +10,6 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from analysis import outputs
@@ -18,7 +17,7 @@ from analysis.cli import main, parser
 from analysis.data.matching import Filter
 from analysis.data.selection import Selection, select
 from analysis.figures.losses import _title, loss_plot
-from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot, spectrum_plot
+from analysis.figures.phase_portraits import phase_plot, spectrum_plot
 from analysis.outputs import FIGURES, NAMES, build, plots
 from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
@@ -147,23 +146,6 @@ def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:
     assert "in grey" not in spectrum.make(reader, alone, PlotOptions()).caption
     grey = select(reader, Filter(("cartpole",), ("d_optimal", "random")))
     assert "; random in grey;" in spectrum.make(reader, grey, PlotOptions()).caption
-
-
-@pytest.mark.parametrize(
-    ("coverage", "error", "n", "words"),
-    [
-        (0.1234, 0.00021, 100, "coverage 12.340 ± 0.042 %"),
-        (0.5, 0.02, 9, "coverage 50.0 ± 4.0 %"),
-        (0.125, float("nan"), 1, "coverage 12.5 %"),
-        (float("nan"), float("nan"), 0, "coverage unknown"),
-    ],
-)
-def test_a_coverage_has_the_digits_of_its_error(
-    coverage: float, error: float, n: int, words: str
-) -> None:
-    nowhere = np.empty((0, 2))
-    portrait = Portrait("random", nowhere, np.zeros(2), False, coverage, error, n, 0)
-    assert coverage_text(portrait) == words
 
 
 def test_what_is_drawn_twice_has_the_same_bytes(

@@ -91,31 +91,6 @@ def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
     assert choice((assessed, 5), (plain, 5), (far, 5)) == [plain]
 
 
-def test_policies_under_other_limits_are_never_mixed_in() -> None:
-    rail = {"bounds": {"y": [-2.0, 2.0]}}
-    kinds = {
-        "none": {},
-        "counted": {"limits": {**rail, "enforced": False}},
-        "enforced": {"limits": {**rail, "enforced": True}},
-    }
-    stored = {
-        (policy, kind): config("cartpole", policy, **limits)
-        for policy in ("d_optimal", "random", "oracle")
-        for kind, limits in kinds.items()
-    }
-
-    def chosen(**trials: int) -> set[str]:
-        pool = [replace(one, n_done=trials.get(kind, 0)) for (_, kind), one in stored.items()]
-        kept = {one.config_key for one in choose([one for one in pool if one.n])}
-        return {kind for (_, kind), one in stored.items() if one.config_key in kept}
-
-    assert chosen(none=5, counted=5, enforced=5) == {"none"}
-    assert chosen(counted=5, enforced=5) == {"enforced"}
-    assert chosen(none=3, counted=5) == {"counted"}
-    reference, oracle = stored["d_optimal", "enforced"], stored["oracle", "none"]
-    assert choice((reference, 5), (oracle, 9)) == [reference]
-
-
 def test_between_learners_with_equal_trials_the_usual_one_decides() -> None:
     learners = {name: {"learner": {"name": name}} for name in ("adam_window", "ekf", "adam_replay")}
     configs = {

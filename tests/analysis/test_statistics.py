@@ -36,12 +36,10 @@ from analysis.stats.scores import (
     compare_hitting_times,
     first_passage,
     last_passage,
-    mean_losses,
     mean_over_steps,
     on_front,
     sign_test,
     signed_rank,
-    steps_to,
     without_ratio,
 )
 from analysis.tables.comparisons import compare_policies, compare_steps
@@ -232,26 +230,6 @@ def test_a_median_past_the_horizon_is_censored() -> None:
     assert censored_median(np.array([1.0, 2.0, INF])) == 2
     assert censored_median(np.array([1.0, 2.0, INF, INF])) == INF  # just half of them reached it
     assert math.isnan(censored_median(np.empty(0)))
-
-
-def test_scores_follow_from_the_stored_curves(reader: Reader) -> None:
-    (entry,) = select(reader, Filter(("pendulum",), ("uniform",))).entries
-    curves = np.array([curve("pendulum", "uniform", seed) for seed in SEEDS])
-    arguments = (reader, entry, "loss")
-    np.testing.assert_allclose(
-        mean_losses(*arguments).values, np.exp(np.mean(np.log(curves), axis=1))
-    )
-    middle = float(np.median(curves))
-    np.testing.assert_array_equal(
-        steps_to(*arguments, middle).values, first_passage(curves, middle)
-    )
-
-
-def test_a_diverged_trial_is_left_out_of_the_scores_and_counted(reader: Reader) -> None:
-    (entry,) = select(reader, Filter(("cartpole",), ("random",))).entries
-    scores = mean_losses(reader, entry, "loss")
-    assert sorted(scores.by_seed) == [0, 1, 3, 4]
-    assert scores.describe() == "4/5, 1 diverged"
 
 
 def test_the_area_compares_whole_curves(reader: Reader) -> None:

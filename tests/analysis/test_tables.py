@@ -34,7 +34,7 @@ from analysis.stats.scores import (
     scores_at,
     true_model,
 )
-from analysis.style import number, p_text, plus_minus
+from analysis.style import number, p_text, percent_text, plus_minus
 from analysis.tables.comparisons import compare_policies, summarise
 from analysis.tables.rendering import comparison_table, summary_table
 from analysis.tables.variants import VariantGroup, tabulate_control_of, variant_groups
@@ -136,6 +136,9 @@ def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
         (plus_minus(4.021e-5, 6.2e-6), "(4.02 ± 0.62)e-05"),
         (plus_minus(2.0, math.nan), "2.00"),
         (plus_minus(math.nan, math.nan), "–"),
+        (percent_text(0.1234, 0.00021, 100), "12.340 ± 0.042 %"),
+        (percent_text(0.125, math.nan, 1), "12.5 %"),
+        (percent_text(math.nan, math.nan, 0), ""),
         (number(0.5), "0.500"),
         (number(1234.0), "1230"),
         (number(0.0123456), "0.0123"),

@@ -112,15 +112,6 @@ def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> Non
     np.testing.assert_allclose(found["quantiles"], np.quantile(us, [0.5, 0.99, 1.0]))
 
 
-def test_a_trial_names_its_unusual_settings(
-    visit: Callable[..., TestClient], variants_grid: str
-) -> None:
-    client = visit(variants_grid)
-    rows = client.get("/api/trials?policy=random&env=pendulum&seed=0").json()["rows"]
-    (wide,) = (row for row in rows if "γ=3" in row["label"])
-    assert "random, γ=3, horizon 40" in client.get(f"/trials/{wide['trial_key']}").text
-
-
 def test_a_failed_trial_shows_its_traceback_as_text(client: TestClient) -> None:
     (row,) = client.get("/api/trials?status=failed").json()["rows"]
     page = client.get(f"/trials/{row['trial_key']}").text

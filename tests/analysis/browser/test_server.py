@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import re
 import select
-import shutil
 import signal
 import socket
 import subprocess
@@ -208,31 +206,6 @@ def run(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run in a thread: in this one the browser of other tests may have a loop that runs."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(asyncio.run, coroutine).result()
-
-
-@contextmanager
-def heard(address: str) -> Iterator[Iterator[tuple[str, Any]]]:
-    """Yield the events of a server, each with its content."""
-    with httpx.stream("GET", f"{address}/api/events", timeout=PATIENCE_SECONDS) as answer:
-        assert answer.status_code == 200
-        assert answer.headers["content-type"].startswith("text/event-stream")
-        lines = (line for line in answer.iter_lines() if line and not line.startswith(":"))
-        yield (
-            (name.removeprefix("event: "), json.loads(data.removeprefix("data: ")))
-            for name, data in zip(lines, lines, strict=False)
-        )
-
-
-def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
-    with chromium.served(url) as address, heard(address) as stream:
-        name, content = next(stream)
-        assert name == "unavailable"
-        assert "There is no results database" in content["error"]
-        grids.one_trial(f"sqlite:///{tmp_path}/new.db")
-        shutil.move(tmp_path / "new.db", tmp_path / "results.db")
-        name, content = next(stream)
-        assert (name, content["total"]) == ("progress", 1)
 
 
 def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
