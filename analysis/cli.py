@@ -306,10 +306,12 @@ def _serve(options: argparse.Namespace) -> int:
 
 def _listen(host: str, port: int) -> socket.socket:
     """Return a listening socket; raise ``AnalysisError`` where the address is taken or wrong."""
+    if not 0 <= port < 2**16:
+        raise AnalysisError(f"--port is {port}, expected is a number of 0 to 65535: give one.")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise AnalysisError(
             f"The browser cannot listen at {host}:{port} ({error}): give another --port or --host, "
             f"--port 0 takes any free port."

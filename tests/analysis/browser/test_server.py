@@ -43,7 +43,7 @@ def taken() -> Iterator[int]:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--port", "99999"], "port must be 0-65535"),
+        (["--port", "99999"], "expected is a number of 0 to 65535"),
         (["--port", "many"], "invalid int value: 'many'"),
         (["--host", "203.0.113.7"], "cannot listen at 203.0.113.7"),
         (["--host", "no.such.host.invalid"], "cannot listen at no.such.host.invalid"),
