@@ -167,21 +167,14 @@ class LearnedModel:
 
         Raises
         ------
-        AnalysisError
+        SpecificationError
             If they are no numbers, or not of the shapes above.
         """
-        x = _rows(states, self.spec.system.n_states, "states")
-        single = np.ndim(states) == 1
-        u = None if inputs is None else _rows(inputs, self.spec.system.n_inputs, "inputs")
-        if u is not None and len(u) not in (1, len(x)):
-            raise AnalysisError(
-                f"inputs have {len(u)} rows and states have {len(x)}, but as many are expected: "
-                f"give one input for each state."
-            )
-        values = learned_accelerations(self.spec, self.parameters, x, u)
-        if u is not None:
+        values = learned_accelerations(self.spec, self.parameters, states, inputs)
+        if inputs is not None:
+            x, u = np.atleast_2d(states), np.atleast_2d(inputs)
             values = self._derivative(x, u, values)
-        return values[0] if single else values
+        return values[0] if np.ndim(states) == 1 else values
 
     def _derivative(self, x: Array, u: Array, accelerations: Array) -> Array:
         system = self.spec.system
@@ -189,22 +182,6 @@ class LearnedModel:
         flow = np.stack([np.broadcast_to(row, len(x)) for row in known], axis=-1).astype(float)
         flow[:, list(system.learned_rows)] += accelerations
         return flow
-
-
-def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
-    try:
-        rows = np.atleast_2d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError) as error:
-        raise AnalysisError(
-            f"{what} are {reprlib.repr(given)}, but numbers of the shape (N, {size}) or ({size},) "
-            f"are expected: give one row for each point."
-        ) from error
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise AnalysisError(
-            f"{what} have the shape {np.shape(given)}, but (N, {size}) or ({size},) is expected: "
-            f"give one row for each point."
-        )
-    return rows
 
 
 def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
