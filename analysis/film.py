@@ -58,9 +58,8 @@ def body(system: System, states: Array) -> Body | None:
         corners = cart[:, None] + system.length * np.array(CART) * SQUARE
         return Body((corners, np.stack([cart, tip], axis=1)), tip[:, None])
     if isinstance(system, Arm | Chain):
-        chain = isinstance(system, Chain)
-        lengths = system.length if chain else np.array([[system.length_1], [system.length_2]])
-        rods = _rod(states[:, list(system.angle_indices)].T, lengths)
+        sides = [system.length] if isinstance(system, Chain) else [system.length_1, system.length_2]
+        rods = _rod(states[:, list(system.angle_indices)].T, np.array(sides)[:, None])
         ends = np.cumsum(rods, axis=0).swapaxes(0, 1)
         return Body((np.pad(ends, ((0, 0), (1, 0), (0, 0))),), ends)
     if isinstance(system, Quadrotor):
