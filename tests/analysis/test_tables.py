@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from analysis.cli import main
-from analysis.data.matching import AnalysisError, Filter
+from analysis.data.matching import Filter
 from analysis.data.selection import select
 from analysis.figures.phase_portraits import measure_spectra, spectrum_caption
 from analysis.report import CAPTION, EXPLAINED
@@ -105,11 +105,6 @@ def test_a_row_does_not_depend_on_the_others(reader: Reader) -> None:
     same = whole[(whole.env == "cartpole") & (whole.policy == "periodic")]
     columns = ["n_pairs", "ratio", "low", "high", "p_value"]
     assert same[columns].to_numpy().tolist() == part[columns].to_numpy().tolist()
-
-
-def test_nothing_to_compare_is_a_sentence(reader: Reader) -> None:
-    with pytest.raises(AnalysisError, match="only random is selected"):
-        compare_policies(reader, select(reader, Filter(policies=("random",))))
 
 
 def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
