@@ -174,10 +174,6 @@ class Selection:
     def environments(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(entry.config.env for entry in self.entries))
 
-    @property
-    def policies(self) -> tuple[str, ...]:
-        return tuple(sorted({entry.config.policy for entry in self.entries}, key=policy_rank))
-
     def of(self, environment: str) -> tuple[Entry, ...]:
         """Return the entries of one environment."""
         return tuple(entry for entry in self.entries if entry.config.env == environment)

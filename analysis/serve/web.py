@@ -304,11 +304,6 @@ class Events:
         self._reading = asyncio.Lock()
         self._end = asyncio.Event()
 
-    @property
-    def ended(self) -> bool:
-        """Whether the server ends."""
-        return self._end.is_set()
-
     def end(self) -> None:
         """End all streams, now and later."""
         self._end.set()
@@ -322,7 +317,7 @@ class Events:
     async def stream(self) -> AsyncIterator[str]:
         """Yield the progress, and again after every change, until the server ends."""
         sent, said = "", 0.0
-        while not self.ended:
+        while not self._end.is_set():
             latest, now = await self._read(), time.monotonic()
             if latest != sent or now - said >= SILENCE:
                 yield COMMENT if latest == sent else latest
