@@ -10,7 +10,8 @@ no such test.
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from collections import Counter
+from typing import Protocol
 
 import numpy as np
 
@@ -22,9 +23,6 @@ from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Array
-
-if TYPE_CHECKING:
-    from dopt.explorer.state import ExplorerState
 
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
@@ -75,7 +73,8 @@ _TEXTS = {
     "take another one such as 'adam_window'",
     "late": "the errors of the predictions follow from inputs of earlier steps, most from the one "
     "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
-    "once, or as declared: declare Plant(delay=..., lag=...)",
+    "once, or as declared: declare Plant(delay=..., lag=...), or let the learner 'simulation_error' "
+    "fit them (dopt.unknown)",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
     "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
     "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
@@ -83,6 +82,32 @@ _TEXTS = {
     "narrow": "the first 500 states cover %.2g %% of the box along %s, but the model is to hold in "
     "all of it: declare a smaller box, raise gamma, or choose another policy",
 }
+
+
+class Steps(Protocol):
+    """What is read of the steps of an exploration, in scaled numbers."""
+
+    @property
+    def states(self) -> Array: ...
+    @property
+    def inputs(self) -> Array: ...
+    @property
+    def parameters(self) -> Array: ...
+
+
+class Exploration(Protocol):
+    """What is read of a state of an exploration, except for the counts, which are changed."""
+
+    done: int
+    counts: Counter[str]
+    states: Array
+    excess: Array
+    answer: Array | None
+    was_asked: bool
+    system: System
+
+    @property
+    def steps(self) -> Steps: ...
 
 
 class Signs:
@@ -108,7 +133,7 @@ class Signs:
         """Begin at step t from a state that need not follow the one before."""
         self._start = t
 
-    def learned(self, state: ExplorerState, event: Event, seconds: float) -> None:
+    def learned(self, state: Exploration, event: Event, seconds: float) -> None:
         """Count after a step of so many seconds was learned from."""
         done, limits, asked = state.done, self._spec.limits, state.answer
         if state.was_asked and asked is not None and event["applied"] != asked.tolist():
@@ -123,7 +148,7 @@ class Signs:
         if done == AFTER:
             self._measure_box(state)
 
-    def _compare(self, change: Array, state: ExplorerState) -> None:
+    def _compare(self, change: Array, state: Exploration) -> None:
         """Count an input that was not applied as it was asked."""
         if np.abs(change).max() <= ROUNDING * self._spec.system.gamma:
             return
@@ -131,7 +156,7 @@ class Signs:
         if (n := state.counts["altered"]) >= max(MANY, COMMON * state.done):
             self._say("altered", n, state.done)
 
-    def _end_block(self, state: ExplorerState) -> None:
+    def _end_block(self, state: Exploration) -> None:
         before, self._parameters = self._parameters, np.array(state.steps.parameters)
         learner, model = self._spec.learner, self._spec.model  # some move them now and then
         refitted = isinstance(learner, SimulationError)
@@ -153,7 +178,7 @@ class Signs:
                 self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
                 self._rows = []
 
-    def _new_rows(self, state: ExplorerState) -> tuple[Array, ...]:
+    def _new_rows(self, state: Exploration) -> tuple[Array, ...]:
         """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).
 
         They are of the last steps, where these follow others without a gap.
@@ -180,7 +205,7 @@ class Signs:
         return errors[at][:, rows], moved[at][:, rows], given, earlier
 
     def _test(
-        self, state: ExplorerState, errors: Array, moved: Array, given: Array, earlier: Array
+        self, state: Exploration, errors: Array, moved: Array, given: Array, earlier: Array
     ) -> None:
         """Count where inputs of earlier steps explain errors."""
         if not (np.isfinite(errors).all() and np.isfinite(given).all()):
@@ -195,7 +220,7 @@ class Signs:
             state.counts["late"] += 1
             self._say("late", lag, 100.0 * largest)
 
-    def _measure_box(self, state: ExplorerState) -> None:
+    def _measure_box(self, state: Exploration) -> None:
         """Count the sides of the box of which the states so far cover little."""
         system, x = self._spec.system, state.states[: state.done + 1]
         for axis, (low, high) in system.grid_box().items():
