@@ -4,8 +4,8 @@
 #     DOPT_HEAD     address of the cluster's head, such as head:6379; without it a launch is alone
 #     DOPT_NODE_IP  address of this container for the others, by default its first one
 #     DOPT_CPUS     trials at once on this node, by default one for each core
-#     DOPT_DB       database, without its password, which is a file: /run/secrets/postgres_password,
-#                   for the user dopt_read /run/secrets/postgres_read_password
+#     DOPT_DB       database, without its password, which is a file: /run/secrets/postgres_password
+#     DOPT_READ_DB  the same for statements of the browser: /run/secrets/postgres_read_password
 set -eu
 
 SECRETS=/run/secrets

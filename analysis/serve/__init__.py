@@ -1,8 +1,8 @@
 """Results browser: read-only web pages over a results database, served on the local machine.
 
 ``app`` has the routes, ``pages`` computes what they show with the functions behind the figures,
-``web`` reads queries, renders answers and holds the database with its event stream; ``app`` checks
-every request, too.
+``sql`` runs statements, ``web`` reads queries, renders answers and holds the database with its
+event stream; ``app`` checks every request, too.
 """
 
 from __future__ import annotations

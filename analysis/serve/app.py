@@ -2,7 +2,8 @@
 
 A foreign web site may point a DNS name at 127.0.0.1 (DNS rebinding) or embed URLs of this server.
 The Host header reveals the first, Sec-Fetch-Site the second; the response headers keep pages from
-running or loading foreign content. Everything is read by GET; a request changes nothing.
+running or loading foreign content. Statements of the SQL page come by POST, from a form of this
+server alone; a link shows a page and runs nothing.
 """
 
 from __future__ import annotations
@@ -12,31 +13,37 @@ import ipaddress
 import logging
 import re
 import socket
+import threading
 import time
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
+from urllib.parse import parse_qsl
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from analysis.serve import is_loopback, pages
+from analysis.serve import is_loopback, pages, sql
 from analysis.serve.web import (
     FOLDER,
+    BusyError,
     Database,
+    ForbiddenError,
     NotFoundError,
     QueryParams,
+    RequestError,
     ServerState,
     as_csv,
     as_json,
@@ -46,12 +53,17 @@ from dopt.errors import DoptError
 from orchestrate.store import NoDatabaseError, SchemaVersionError, StoreUnavailableError
 
 Numbers = Callable[[ServerState, QueryParams], Mapping[str, Any]]
+Answer = Callable[[ServerState, Request, QueryParams, sql.Stopped], Response]
+
+FORM_SECONDS = 10.0
+"""Time in which a form has to arrive."""
 
 PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/", "grid", pages.grid),
     ("/curves", "curves", pages.choices),
     ("/trials", "trials", pages.trials),
     ("/trials/{trial_key}", "trial", pages.trial),
+    ("/sql", "sql", sql.form),
 )
 DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/grid", pages.grid),
@@ -60,13 +72,11 @@ DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/trials/{trial_key}", pages.trial),
     ("/api/trials/{trial_key}/arrays", pages.arrays),
 )
-MISSING = "This page does not exist: choose a page from the menu above."
-REMOVED = {
-    "/sql": "The page SQL was removed: python -m orchestrate query 'SELECT ...' runs a statement."
-}
 STATES = (
     ((NoDatabaseError, SchemaVersionError, StoreUnavailableError), 503),
+    ((BusyError,), 429),
     ((NotFoundError,), 404),
+    ((ForbiddenError,), 403),
     ((DoptError,), 400),
 )
 
@@ -77,7 +87,7 @@ def create_app(url: str, host: str = "127.0.0.1") -> Starlette:
     Raises ``StoreError`` for an invalid database URL. A database that does not exist yet gives an
     error page until it is created.
     """
-    state = ServerState(Database(url))
+    state = ServerState(Database(url), not is_loopback(host))
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
@@ -89,6 +99,7 @@ def create_app(url: str, host: str = "127.0.0.1") -> Starlette:
             Mount("/static", StaticFiles(directory=FOLDER / "static")),
             *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
             *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
+            *(Route(path, partial(_ask, state, to), methods=["POST"]) for path, to in STATEMENTS),
             Route("/api/curves.csv", partial(_curves_table, state)),
             Route("/api/events", state.events.respond),
         ],
@@ -112,11 +123,55 @@ def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> 
     content = numbers(state, _query_params(request))
     query = defaultdict(str, {k: v for k, v in request.query_params.items() if v})
     frame = {"page": name, "database": state.database.safe_url, "query": query}
-    return as_page(f"{name}.html", frame | dict(content))
+    return as_page(f"{name}.html", frame | dict(content), 400 if content.get("error") else 200)
 
 
 def _data(state: ServerState, numbers: Numbers, request: Request) -> Response:
-    return as_json(numbers(state, _query_params(request)))
+    content = numbers(state, _query_params(request))
+    return as_json(content, 400 if content.get("error") else 200)
+
+
+async def _ask(state: ServerState, answer: Answer, request: Request) -> Response:
+    """Run the statement of a form until it ends, its client leaves, or the server ends."""
+    params = await _form(request)
+    left = threading.Event()
+
+    def stopped() -> bool:
+        return left.is_set() or state.events.ended
+
+    work = asyncio.create_task(run_in_threadpool(answer, state, request, params, stopped))
+    leaving = asyncio.create_task(_leaving(request))
+    try:
+        await asyncio.wait((work, leaving), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        left.set()
+        leaving.cancel()
+    return await work
+
+
+async def _form(request: Request) -> QueryParams:
+    body = b""
+    try:
+        async with asyncio.timeout(FORM_SECONDS):
+            async for part in request.stream():
+                body += part
+                if len(body) > LONGEST_QUERY:
+                    raise RequestError(f"The form is too long, at most {LONGEST_QUERY} bytes.")
+    except (TimeoutError, ClientDisconnect) as error:
+        raise RequestError("The form did not arrive whole and in time: send it again.") from error
+    return QueryParams(dict(parse_qsl(body.decode("latin-1"))))
+
+
+async def _leaving(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+STATEMENTS: tuple[tuple[str, Answer], ...] = (
+    ("/sql", lambda state, at, *ask: _page(state, "sql", lambda *_: sql.rows(state, *ask), at)),
+    ("/api/sql", lambda state, at, *ask: _data(state, lambda *_: sql.rows(state, *ask), at)),
+    ("/api/sql.csv", lambda state, _, *ask: as_csv(sql.table(state, *ask), "sql")),
+)
 
 
 def _curves_table(state: ServerState, request: Request) -> Response:
@@ -127,7 +182,7 @@ def _error_response(state: ServerState, request: Request, error: Exception) -> R
     if not isinstance(error, HTTPException):
         status = next(code for kinds, code in STATES if isinstance(error, kinds))
         return _message(state, request, status, str(error))
-    missing = REMOVED.get(request.scope["path"], MISSING)
+    missing = "This page does not exist: choose a page from the menu above."
     sentence = missing if error.status_code == 404 else f"{error.detail}."
     return _message(state, request, error.status_code, sentence)
 
@@ -148,9 +203,9 @@ def _message(state: ServerState, request: Request, status: int, sentence: str) -
 
 
 METHODS = ("GET", "HEAD")
-ALLOW = {"allow": ", ".join(METHODS)}
+_STATEMENTS = re.compile(r"/sql|/api/sql(\.csv)?")
 LONGEST_QUERY = 16_000
-"""Bytes of a query string; beyond it the answer is 414."""
+"""Bytes of a query string; a long SQL statement has a few thousand."""
 
 HEADERS = {
     "content-security-policy": (
@@ -205,22 +260,47 @@ class SecurityMiddleware:
             await send(message)
 
         refusal = self._refusal(scope)
-        answer = self._app if refusal is None else PlainTextResponse(refusal[1], refusal[0], ALLOW)
+        answer = self._app if refusal is None else _plain(scope["path"], *refusal)
         await answer(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
-        headers, method = Headers(scope=scope), scope["method"]
-        if method not in METHODS:
-            return 405, f"{method} is not answered here: use GET.\n"
+        headers = Headers(scope=scope)
+        method, allowed = scope["method"], _methods(scope["path"])
+        if method not in allowed:
+            return 405, f"{method} is not answered here: use {allowed[0]}.\n"
         if not is_own(headers.getlist("host"), self._host):
             return 421, (
                 "The Host header names another server: open the address that the command printed.\n"
             )
         if headers.get("sec-fetch-site") == "cross-site" and not _is_visit(headers):
             return 403, "Another web site asked for this: open the page itself.\n"
+        if method == "POST" and not _is_own_form(headers):
+            return 403, "Another web site sent this form: open the page SQL and send its own.\n"
         if len(scope["query_string"]) > LONGEST_QUERY:
             return 414, f"The address is too long, at most {LONGEST_QUERY} bytes after the '?'.\n"
         return None
+
+
+def _methods(path: str) -> tuple[str, ...]:
+    if _STATEMENTS.fullmatch(path) is None:
+        return METHODS
+    return (*METHODS, "POST") if path == "/sql" else ("POST",)
+
+
+def _plain(path: str, status: int, text: str) -> PlainTextResponse:
+    headers = {"allow": ", ".join(_methods(path))} if status == 405 else None
+    return PlainTextResponse(text, status, headers)
+
+
+def _is_own_form(headers: Headers) -> bool:
+    """Return True if the browser says that a page of this server sent the form, or says nothing.
+
+    Under the referrer policy of these pages the origin of a form is "null". The token decides in
+    any case.
+    """
+    site, origin = headers.get("sec-fetch-site"), headers.get("origin", "null")
+    own = f"://{headers['host']}"
+    return site in ("same-origin", "none", None) and (origin == "null" or origin.endswith(own))
 
 
 def _is_visit(headers: Headers) -> bool:

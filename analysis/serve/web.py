@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 import math
+import secrets
 import threading
 import time
 from collections import OrderedDict
@@ -29,7 +30,7 @@ from analysis.data.selection import Selection, select
 from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
-from orchestrate.store.backends.base import parse_url, public_url, sqlite_path
+from orchestrate.store.backends.base import parse_url, public_url, read_login, sqlite_path
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -45,6 +46,14 @@ class RequestError(AnalysisError):
 
 class NotFoundError(AnalysisError):
     """The trial does not exist."""
+
+
+class ForbiddenError(AnalysisError):
+    """The request comes from another site, or needs a right that is not given."""
+
+
+class BusyError(AnalysisError):
+    """Too many queries are running."""
 
 
 class QueryParams:
@@ -188,6 +197,7 @@ _pages.filters.update(
     duration=duration,
     mebibytes=lambda count: "–" if count is None else f"{count / 2**20:.0f} MiB",
     title=environment_title,
+    exact=lambda value: f"{value:.10g}",
 )
 
 
@@ -220,6 +230,9 @@ class Database:
         parsed = parse_url(url)
         self.safe_url = public_url(parsed)
         self._url = url
+        self.is_file = parsed.get_backend_name() != "postgresql"
+        self.user = parsed.username
+        self.read_login = read_login(parsed)
         self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
         self._lock = threading.Lock()
         self._reader: Reader | None = None
@@ -308,6 +321,10 @@ class Events:
         """End all streams, now and later."""
         self._end.set()
 
+    @property
+    def ended(self) -> bool:
+        return self._end.is_set()
+
     async def respond(self, request: Request) -> Response:
         """Return the stream."""
         if request.method == "HEAD":
@@ -317,7 +334,7 @@ class Events:
     async def stream(self) -> AsyncIterator[str]:
         """Yield the progress, and again after every change, until the server ends."""
         sent, said = "", 0.0
-        while not self._end.is_set():
+        while not self.ended:
             latest, now = await self._read(), time.monotonic()
             if latest != sent or now - said >= SILENCE:
                 yield COMMENT if latest == sent else latest
@@ -347,9 +364,14 @@ class Events:
 
 @dataclass(frozen=True)
 class ServerState:
-    """The database with its event stream, and caches of computed values."""
+    """The database with its event stream, and caches of computed values.
+
+    ``exposed``: other machines reach the server. ``token``: secret of this process's forms.
+    """
 
     database: Database
+    exposed: bool = False
+    token: str = field(default_factory=secrets.token_urlsafe)
     cache: Cache = field(default_factory=Cache)
     selections: Cache = field(default_factory=lambda: Cache(6))  # each contains all its trials
 

@@ -19,7 +19,7 @@ from orchestrate.errors import (
     StoreUnavailableError,
 )
 from orchestrate.records import URL_VARIABLE, Failure, RunRecord
-from orchestrate.store.backends.base import DEFAULT_URL, default_url
+from orchestrate.store.backends.base import DEFAULT_URL, READ_VARIABLE, default_url
 from orchestrate.store.launches import OpenConfig, OpenTrial
 from orchestrate.store.reader import (
     ExplorationRow,
@@ -48,6 +48,7 @@ __all__ = [
     "DEFAULT_URL",
     "FINISHED",
     "LEASE_SECONDS",
+    "READ_VARIABLE",
     "RETRIED",
     "URL_VARIABLE",
     "Assessments",

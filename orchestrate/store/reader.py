@@ -13,7 +13,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from select import POLLIN
@@ -74,17 +74,18 @@ def run_select(
     sql: str,
     limit: int | None = None,
     timeout: float | None = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Table:
     """Return the first ``limit`` rows of the statement.
 
     ``request`` says how the driver connects. The process is killed after ``timeout`` seconds, when
-    its answer is too large, and with this process.
+    its answer is too large, when ``stopped`` says so, and with this process.
     """
     given = {"sql": sql, "seconds": timeout, "limit": None if limit is None else limit + 1}
     request = {**request, **given, "path": [folder for folder in sys.path if folder]}
     with translated_query(safe_url, timeout):
         with _process(request) as process:
-            answer = _read(process, timeout)
+            answer = _read(process, timeout, stopped)
         parts = [None, *_unpickled(answer)]
         end = parts.pop()
         if not isinstance(end, dict):
@@ -122,13 +123,15 @@ def _process(request: Request) -> Iterator[subprocess.Popen[bytes]]:
             process.kill()
 
 
-def _read(process: subprocess.Popen[bytes], seconds: float | None) -> bytes:
+def _read(
+    process: subprocess.Popen[bytes], seconds: float | None, stopped: Callable[[], bool]
+) -> bytes:
     """Return what the process writes; its time begins with the first byte."""
     assert process.stdout
     answer, end = bytearray(), float("inf")
     poll = new_poll()
     poll.register(process.stdout, POLLIN)
-    while True:
+    while not stopped():
         if time.monotonic() > end:
             raise out_of_time(seconds)
         if not poll.poll(_PAUSE_MILLISECONDS):
@@ -144,6 +147,7 @@ def _read(process: subprocess.Popen[bytes], seconds: float | None) -> bytes:
                 f"The result is larger than {RESULT_BYTES / 1e6:g} MB, the most that a query "
                 "returns: select fewer rows or columns, or take 'python -m orchestrate export'."
             )
+    raise QueryError("The query was cancelled, because nobody waits for it: run it again.")
 
 
 def _unpickled(answer: bytes) -> Iterator[Any]:
@@ -345,15 +349,19 @@ class Reader:
         sql: str,
         limit: int | None = None,
         timeout: float | None = None,
+        login: URL | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> Table:
         """Return the rows of one SELECT, with values by position and by column name.
 
         Only the first ``limit`` rows are read; ``cut`` of the table is True if there are more.
-        The statement runs in a process and through a connection of its own. Raises ``QueryError``
-        if the database rejects the statement, such as one that writes or several in one text, or
-        if it takes longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
+        The statement runs in a process and through a connection of its own, with the URL ``login``
+        where one is given, until ``stopped`` says True. Raises ``QueryError`` if the database
+        rejects the statement, such as one that writes or several in one text, or if it takes
+        longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
         """
-        return run_select(self._kind.request(self._url), self.safe_url, sql, limit, timeout)
+        request = self._kind.request(login or self._url)
+        return run_select(request, self.safe_url, sql, limit, timeout, stopped)
 
     def rows(self, sql: str, /, **values: object) -> Table:
         """Return the rows of a trusted SELECT, with each ``:name`` in it bound to a value.

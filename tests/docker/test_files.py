@@ -24,6 +24,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.store import QueryError, Reader
 from tests.analysis.browser import grids
 from tests.analysis.browser.conftest import BASE
+from tests.analysis.browser.grids import post
 from tests.machines.hosts import unavailable
 from tests.pages import PAGES
 from tests.paths import ROOT
@@ -207,7 +208,7 @@ def make_reader(database: str, tmp_path: Path) -> Callable[[str], str]:
 
 
 def test_it_reads_tables_that_come_later_and_writes_nothing(
-    database: str, make_reader: Callable[[str], str]
+    database: str, make_reader: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     login = make_reader("a'b \\ \"c")
     grids.one_trial(database)
@@ -222,9 +223,11 @@ def test_it_reads_tables_that_come_later_and_writes_nothing(
         with engine.connect() as connection, refused:
             connection.execute(text(statement))
     engine.dispose()
+    monkeypatch.setenv("DOPT_READ_DB", login)
     with TestClient(create_app(login, "0.0.0.0"), base_url=BASE) as client:
-        for page in ("/", "/curves", "/trials"):
+        for page in ("/", "/curves", "/trials", "/sql"):
             assert client.get(page).status_code == 200, page
+        assert post(client, "/api/sql", "SELECT count(*) FROM v_trial").json()["rows"] == [[1]]
 
 
 def test_the_files_run_it_where_the_secret_is() -> None:

@@ -35,6 +35,9 @@ from orchestrate.records import URL_VARIABLE
 
 DEFAULT_URL = "sqlite:///results/results.db"
 
+READ_VARIABLE = "DOPT_READ_DB"
+"""Environment variable with the URL of a user who can only read, as whom the page SQL asks."""
+
 _IN_MEMORY = ":memory:"
 _EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name"
 _SQLITE_FILE = re.compile(r"[\w./-]+\.(db|sqlite3?)")
@@ -52,11 +55,12 @@ def parse_url(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
     The path of a file is read as :func:`dopt.errors.given_path` does. The message says whether
-    the URL came from ``DOPT_DB``. It repeats no text other than a path, because a mistyped URL may
-    hold a password.
+    the URL came from ``DOPT_DB`` or ``DOPT_READ_DB``. It repeats no text other than a path, because
+    a mistyped URL may hold a password.
     """
-    named = os.environ.get(URL_VARIABLE, "").strip() == url.strip() != ""
-    where = f" in the environment variable {URL_VARIABLE}" if named else ""
+    variables = (URL_VARIABLE, READ_VARIABLE)
+    names = [name for name in variables if os.environ.get(name, "").strip() == url.strip() != ""]
+    where = f" in the environment variable {names[0]}" if names else ""
     url = stripped(url, f"The database URL{where}", StoreError)
     if "://" not in url and Path(url).is_dir():
         raise StoreError(
@@ -84,6 +88,18 @@ def parse_url(url: str) -> URL:
         file = given_path(parsed.database, f"The path in the database URL{where}", StoreError)
         parsed = parsed.set(database=str(file))
     return parsed.set(drivername=backend)
+
+
+def read_login(url: URL) -> URL | None:
+    """Return the URL of the user who can only read, None where no variable names one of ``url``."""
+    found = parse_url(os.environ[READ_VARIABLE]) if os.environ.get(READ_VARIABLE) else None
+    if found is None or _place(found) != _place(url):
+        return None
+    return found.set(query={**url.query, **found.query})
+
+
+def _place(url: URL) -> tuple[object, ...]:
+    return url.get_backend_name(), url.host, url.port or 5432, url.database
 
 
 def public_url(url: URL) -> str:

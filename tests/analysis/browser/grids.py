@@ -1,10 +1,14 @@
-"""Grids of the states that a page must show, in a database of either kind."""
+"""Grids of the states that a page must show, in a database of either kind, and the SQL form."""
 
 from __future__ import annotations
 
+import re
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
+
+from httpx import Response
+from starlette.testclient import TestClient
 
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
@@ -98,6 +102,19 @@ def _key(specs: list[TrialSpec], env: str, policy: str, seed: int) -> str:
         for spec in specs
         if (spec.system.name, spec.policy.name, spec.seed) == (env, policy, seed)
     )
+
+
+def token(client: TestClient) -> str:
+    """Return the token of the form."""
+    found = re.search(r'name="token" value="([\w-]+)"', client.get("/sql").text)
+    assert found
+    return found[1]
+
+
+def post(client: TestClient, path: str, statement: str, **headers: str) -> Response:
+    """Send a statement, with headers whose names have underscores for dashes."""
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return client.post(path, data={"q": statement, "token": token(client)}, headers=named)
 
 
 def launch(url: str, seeds: int, folder: Path) -> int:

@@ -128,7 +128,7 @@ def test_the_token_changes_with_the_grid_alone(client: TestClient) -> None:
     assert (first["ended"], first["total"]) == (45, 48)
 
 
-PAGES = ("/", "/curves", "/trials")
+PAGES = ("/", "/curves", "/trials", "/sql")
 Visit = Callable[..., TestClient]
 
 
@@ -167,7 +167,7 @@ def check(client: TestClient, path: str) -> str:
 
 
 def test_every_page_of_a_mixed_grid_is_well_made(client: TestClient) -> None:
-    for path in PAGES:
+    for path in (*PAGES, "/sql?q=SELECT env FROM v_trial"):
         assert "read-only" in check(client, path)
     for row in client.get("/api/trials").json()["rows"]:
         check(client, f"/trials/{row['trial_key']}")

@@ -21,7 +21,10 @@ from tests.waiting import PATIENCE_SECONDS
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text()
-PATHS = ("/", "/curves", "/trials")
+PATHS = (
+    *("/", "/curves", "/trials"),
+    "/sql?q=SELECT env, seed FROM v_trial",
+)
 TRIALS = ("/trials?status=failed", "/trials?env=cartpole&status=diverged")
 WIDE = """[...document.querySelectorAll('main .card:not(.scroll)')]
   .filter((box) => box.scrollWidth > box.clientWidth).map((box) => box.innerText.slice(0, 60))"""
@@ -140,6 +143,32 @@ def test_the_list_sorts_filters_and_turns_pages(page: Page) -> None:
     expect(page.locator("caption")).to_have_text("12 trials")
 
 
+def test_sql_answers_refuses_and_downloads(browser: Browser, address: str) -> None:
+    with chromium.strict_page(browser, address, complaint="status of 400") as page:
+        use_sql(page)
+
+
+def use_sql(page: Page) -> None:
+    page.goto("/sql")
+    page.get_by_role("link", name="Final losses").click()
+    expect(page.get_by_label("Statement")).to_have_value(re.compile("avg"))
+    expect(page.locator("#answer")).to_have_count(0)
+    page.get_by_role("button", name="Run").click()
+    expect(page.locator("#answer tbody tr")).to_have_count(12)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download CSV").click()
+    assert download.value.path().read_text().startswith("env,policy,width,n,mean")
+    box = page.get_by_label("Statement")
+    box.fill("DELETE FROM trial")
+    box.press("Control+Enter")
+    expect(page.get_by_role("alert")).to_contain_text("The query failed")
+    expect(box).to_have_value("DELETE FROM trial")
+    box.fill("SELECT trial_key FROM v_trial WHERE status = 'failed'")
+    page.get_by_role("button", name="Run").click()
+    page.locator("#answer tbody a").click()
+    expect(page.locator("h1")).to_contain_text("pendulum, periodic")
+
+
 def test_a_choice_while_the_page_loads_is_applied(page: Page) -> None:
     def answer_late(route: Route) -> None:
         time.sleep(0.5)
@@ -228,7 +257,7 @@ def test_small_databases_are_shown_without_complaint(
     url = f"sqlite:///{tmp_path}/results.db"
     state(url)
     page = show(url)
-    for path in PATHS:
+    for path in ("/", "/curves", "/trials", "/sql"):
         page.goto(path)
         expect(page.locator("h1")).to_be_visible()
         if path == "/curves" and state is not grids.nothing:

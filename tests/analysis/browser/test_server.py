@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import re
 import select
 import signal
@@ -16,19 +17,20 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, aclosing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import urlencode, urlsplit
 
 import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
 from analysis.cli import main
+from analysis.serve import app, web
 from analysis.serve import app as serving
-from analysis.serve import web
 from analysis.serve.web import Cache, Database, Events, plain, read_progress
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
+from tests.orchestrate.faults.laboratory import alive, children, command_line
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until
 
@@ -93,6 +95,8 @@ def test_numbers_that_are_not_finite_are_null() -> None:
     assert found == {"a": [None, None, 1.5], "b": [True, None, "x"]}
 
 
+ENDLESS = "SELECT instr(hex(zeroblob(30000000)), hex(zeroblob(15000000)) || '1')"
+LARGE = "SELECT hex(zeroblob(15000000))"
 HALF = b"GET / HTTP/1.1\r\nHost: 127"
 
 
@@ -115,16 +119,32 @@ def is_closed(connection: socket.socket) -> bool:
         return True
 
 
-def request(address: str, path: str) -> bytes:
-    return f"GET {path} HTTP/1.1\r\nHost: {urlsplit(address).netloc}\r\n\r\n".encode()
+def request(address: str, path: str, body: bytes | None = None) -> bytes:
+    method, length = ("GET", 0) if body is None else ("POST", len(body))
+    head = f"{method} {path} HTTP/1.1\r\nHost: {urlsplit(address).netloc}\r\n"
+    return f"{head}Content-Length: {length}\r\n\r\n".encode() + (body or b"")
+
+
+def asking(address: str, statement: str = ENDLESS) -> bytes:
+    """Return a request of a statement, by default of one that takes hours."""
+    page = httpx.get(f"{address}/sql", timeout=PATIENCE_SECONDS).text
+    (token,) = re.findall(r'name="token" value="([\w-]+)"', page)
+    return request(address, "/api/sql", urlencode({"q": statement, "token": token}).encode())
+
+
+def queries(pid: int) -> list[int]:
+    """Return the processes of statements."""
+    return [one for one in children(pid) if "query_process" in command_line(one)]
 
 
 @contextmanager
 def opened(address: str) -> Iterator[None]:
-    """Hold half a request, an event stream, and nothing."""
+    """Hold half a request, an event stream, and half a form."""
+    form = request(address, "/api/sql", b"q=SELECT")[:-3]
     with (
         connected(address, HALF),
         connected(address, request(address, "/api/events")) as stream,
+        connected(address, form),
         connected(address, b""),
     ):
         assert stream.recv(100).startswith(b"HTTP/1.1 200")
@@ -141,8 +161,25 @@ def test_ctrl_c_ends_the_server_whoever_is_connected(sqlite_grid: str) -> None:
         assert server.stdout
         (address,) = re.findall(r"http://127\.0\.0\.1:\d+", server.stdout.readline())
         stack.enter_context(opened(address))
+        unread = stack.enter_context(connected(address, asking(address, LARGE)))
+        assert unread.recv(1)
+        asked = asking(address)
+        for _ in range(4):  # two more than run at once
+            stack.enter_context(connected(address, asked))
+        until(lambda: len(queries(server.pid)) == 2)
+        running = queries(server.pid)
         server.send_signal(signal.SIGINT)
         assert server.wait(PATIENCE_SECONDS) == 0
+        until(lambda: not any(map(alive, running)))
+
+
+def test_a_statement_ends_with_its_client(sqlite_grid: str) -> None:
+    with chromium.served(sqlite_grid) as address:
+        client = connected(address, asking(address))
+        until(lambda: queries(os.getpid()))
+        (running,) = queries(os.getpid())
+        client.close()
+        until(lambda: not alive(running))
 
 
 def test_half_open_connections_are_few(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,6 +222,14 @@ def test_streams_outlive_the_time_of_a_request(
         assert stream.recv(2**16)
         until(lambda: is_closed(half))
         assert not is_closed(stream)
+
+
+def test_half_a_form_is_given_up(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(app, "FORM_SECONDS", 0.2)
+    with chromium.served(sqlite_grid) as address:
+        form = request(address, "/api/sql", b"q=SELECT")[:-3]
+        with connected(address, form) as half:
+            assert half.recv(2**16).startswith(b"HTTP/1.1 400")
 
 
 def test_strangers_cannot_fill_the_log(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -265,6 +265,11 @@ def test_a_query_that_was_killed_is_one_sentence(
         file.query("SELECT 1" + " " * 10**6)
 
 
+def test_it_ends_when_nobody_waits_for_it(reader: Reader) -> None:
+    with pytest.raises(QueryError, match="nobody waits for it"):
+        reader.query(ENDLESS, stopped=lambda: True)
+
+
 def test_a_statement_cannot_lift_its_limit(on_server: Reader) -> None:
     with pytest.raises(QueryError, match=r"longer than 0\.5 s"):
         on_server.query(

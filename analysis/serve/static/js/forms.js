@@ -23,3 +23,7 @@ addEventListener("pageshow", () => {
 document.addEventListener("change", ({ target }) => {
   if (target instanceof HTMLSelectElement && target.matches("form[action][data-auto] select")) target.form.requestSubmit();
 });
+
+document.addEventListener("keydown", ({ key, ctrlKey, metaKey, target }) => {
+  if (key === "Enter" && (ctrlKey || metaKey) && target.matches("form[action] textarea")) target.form.requestSubmit();
+});
