@@ -7,12 +7,9 @@ missing and ``--allow-partial`` was not given; 130: interrupted.
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import os
 import socket
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +17,6 @@ import pandas as pd
 
 from analysis import log_report, report
 from analysis.data.matching import REFERENCE, AnalysisError, Filter, IncompleteError, read_condition
-from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
@@ -38,7 +34,6 @@ from analysis.tables.rendering import (
     sample_loss_kind,
 )
 from dopt.errors import install_command
-from dopt.process import usable_cores
 from dopt.result import Assessment
 from orchestrate.program import Parser, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, Store, default_url
@@ -79,21 +74,20 @@ def parser() -> Parser:
     figures = _command(commands, "figures", _figures, "draw the paper's figures and tables")
     figures.add_argument("--out", type=path("--out"), default="figures", help="folder (figures/)")
     figures.add_argument("--only", action="append", choices=NAMES, help="this output (repeat)")
-    figures.add_argument("--x", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1")
+    figures.add_argument(
+        "--x", dest="axis", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1"
+    )
     figures.add_argument(
         "--statistic", choices=list(Statistic), default=Statistic.MEAN, help="centre of figure 1"
     )
     figures.add_argument(
-        "--style", choices=list(Spread), default=Spread.BAND, help="intervals of figure 1"
+        "--style",
+        dest="spread",
+        choices=list(Spread),
+        default=Spread.BAND,
+        help="intervals of figure 1",
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
-    cores = usable_cores()
-    figures.add_argument(
-        "--workers",
-        type=positive("--workers", int),
-        default=cores,
-        help="outputs at a time (one for each core)",
-    )
     summary = _command(commands, "summary", _table, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _table, "every variant against the reference, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
@@ -103,8 +97,8 @@ def parser() -> Parser:
     aggregate = _command(
         commands, "aggregate", _table, "every variant against the reference, over all systems"
     )
-    calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP, diverged=False)
-    sampled = _command(commands, "sample-loss", _table, SAMPLE_LOSS_HELP, diverged=False)
+    calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP)
+    sampled = _command(commands, "sample-loss", _table, SAMPLE_LOSS_HELP)
     sampled.add_argument("--store", action="store_true", help="keep what is fitted in the database")
     tables = {
         summary: lambda _: TABLES["summary"],
@@ -136,9 +130,6 @@ def parser() -> Parser:
             metavar="KEY",
             help="settings of which each value is shown once, such as width or env.gamma (policy)",
         )
-    figures.add_argument(
-        "--color-by", metavar="KEY", help="setting that colours figure 1 (the first of --group-by)"
-    )
     report.add_arguments(compared)
     compared.set_defaults(alone=lambda options: report.run(options, wanted(options)))
     film = "a film of one stored trial: system, phase trace, learned and true force, loss"
@@ -167,20 +158,11 @@ def _command(
     name: str,
     run: object,
     help_text: str,
-    *,
-    diverged: bool = True,
 ) -> Parser:
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run)
     add_database(command)
     add_selection(command)
-    if diverged:
-        command.add_argument(
-            "--diverged",
-            choices=list(DivergenceRule),
-            default=DivergenceRule.EXCLUDE,
-            help="what a diverged trial counts as",
-        )
     return command
 
 
@@ -219,15 +201,11 @@ def wanted(options: argparse.Namespace) -> Filter:
 
 def _plot_options(options: argparse.Namespace) -> PlotOptions:
     """Return what a command was asked to show; options that it lacks are as usual."""
-    names = {"rule": "diverged", "axis": "x", "spread": "style"}
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(PlotOptions):
-        name = names.get(field.name, field.name)
-        if name in options:
-            kind: Any = type(field.default)
-            value = getattr(options, name)
-            found[field.name] = value if field.default is None else kind(value)
-    return PlotOptions(**found)
+    kinds = {"axis": Axis, "statistic": Statistic, "spread": Spread}
+    given: dict[str, Any] = {
+        name: kind(getattr(options, name)) for name, kind in kinds.items() if name in options
+    }
+    return PlotOptions(**given, epsilon=getattr(options, "epsilon", None))
 
 
 def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
@@ -237,7 +215,6 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
     for outcome in build(
         *(reader, selection, _plot_options(options), options.out, tuple(options.only or NAMES)),
         force=options.force,
-        workers=options.workers,
     ):
         say(f"{options.out / outcome.name}: {outcome.state}")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
@@ -267,11 +244,11 @@ def _animate(options: argparse.Namespace) -> int:
 
 def _table(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     """Print the table of a command."""
-    kind, plot_options, form = options.table(options), _plot_options(options), options.format
-    table = kind.measure(reader, selection, plot_options)
+    kind, form = options.table(options), options.format
+    table = kind.measure(reader, selection, _plot_options(options))
     if selection.gaps:
         tell(sys.stderr, f"{partial_warning(selection)}\n")
-    tell(sys.stdout, _text(kind.render(table, plot_options), table, form), exact=form == "csv")
+    tell(sys.stdout, _text(kind.render(table), table, form), exact=form == "csv")
     return 0
 
 
@@ -300,20 +277,13 @@ def say(text: str) -> None:
 def _add_serve(commands: argparse._SubParsersAction[Parser]) -> None:
     serve = commands.add_parser("serve", help=SERVE_HELP, description=SERVE_HELP)
     serve.set_defaults(alone=_serve)
-    serve.add_argument(
-        "--db", nargs="+", default=[default_url()], metavar="URL", help=f"(DOPT_DB, {DEFAULT_URL})"
-    )
+    add_database(serve)
     serve.add_argument("--port", type=int, default=PORT, help=f"port, 0: any free one ({PORT})")
     serve.add_argument("--host", default=HOST, help=f"address to listen at ({HOST})")
 
 
 def _serve(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
-    if len(options.db) > 1:
-        raise AnalysisError(
-            f"A browser shows one database, but {len(options.db)} are given: start one for each, "
-            f"with --port 0, or put them together with orchestrate merge."
-        )
     try:
         from analysis.serve.app import Server, create_app
     except ModuleNotFoundError as error:
@@ -321,12 +291,12 @@ def _serve(options: argparse.Namespace) -> int:
             f"The browser needs the library {error.name}: "
             f"install it with {install_command('serve')}."
         ) from error
-    app = create_app(options.db[0], options.host)
+    app = create_app(options.db, options.host)
     listening = _listen(options.host, options.port)
     sys.stdout.write(_greeting(options, listening.getsockname()[1]))
     sys.stdout.flush()
     try:
-        Server(app, leave=lambda: os._exit(0)).run(sockets=[listening])
+        Server(app).run(sockets=[listening])
     except KeyboardInterrupt:
         return 0
     finally:
@@ -335,25 +305,17 @@ def _serve(options: argparse.Namespace) -> int:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a bound socket; raise ``AnalysisError`` where the address is taken or wrong."""
+    """Return a listening socket; raise ``AnalysisError`` where the address is taken or wrong."""
     if not 0 <= port < 2**16:
         raise AnalysisError(f"--port is {port}, expected is a number of 0 to 65535: give one.")
-    with ExitStack() as failing:
-        try:
-            family, kind, protocol, _, address = socket.getaddrinfo(
-                host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-            )[0]
-            listening = failing.enter_context(socket.socket(family, kind, protocol))
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listening.bind(address)
-            listening.listen()  # a browser that comes before the first page is ready waits
-        except OSError as error:
-            raise AnalysisError(
-                f"The browser cannot listen at {host}:{port} ({error.strerror or error}): "
-                f"give another --port or --host, --port 0 takes any free port."
-            ) from error
-        failing.pop_all()
-    return listening
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise AnalysisError(
+            f"The browser cannot listen at {host}:{port} ({error}): give another --port or --host, "
+            f"--port 0 takes any free port."
+        ) from error
 
 
 def _greeting(options: argparse.Namespace, port: int) -> str:

@@ -1,18 +1,11 @@
-"""Film of one stored trial: system, phase trace, loss, learned and true accelerations.
-
-A custom system gets a drawing, of polylines and masses in a plane, by registering one::
-
-    @body.register
-    def _(system: MySystem, states: Array) -> Body: ...
-"""
+"""Film of one stored trial: system, phase trace, loss, learned and true accelerations."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import singledispatch
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +17,12 @@ from matplotlib.ticker import MultipleLocator
 from analysis.data.matching import AnalysisError
 from analysis.data.samples import simulated_trial
 from analysis.data.selection import Entry
-from analysis.figures.loss_curves import loss_label
+from analysis.figures.losses import loss_label
 from analysis.figures.panels import angle_ticks, log_ticks, mathematical, styled
 from analysis.stats.curves import DrawnPlane, log_limits
 from analysis.style import BLACK, GREY, environment_title, loss_unit, policy_style, unit_of
 from dopt.run import rerun
-from dopt.systems import Arm, Car, Cartpole, Chain, Quadrotor, System
+from dopt.systems import Arm, Cartpole, Chain, Quadrotor, System
 from orchestrate.files import whole
 from orchestrate.store import Reader
 
@@ -39,97 +32,59 @@ Move = Callable[[int, int], object]  # puts a panel into the state of a frame, a
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 """Corners of a square about the origin, from one back to it."""
 
-CART, WHEEL, BLOCK = (0.3, 0.12), 0.4, 0.3
-"""Half the sides of a cart, by its rod; half a wheel, by its axle; half the side of a block [m]."""
+CART, BLOCK = (0.3, 0.12), 0.3
+"""Half the sides of a cart, by its rod; half the side of a block [m]."""
 
 FOLLOW = 4.0
 """Sizes of its body that a system travels before the view follows it."""
 
 
-@dataclass(frozen=True)
-class Body:
-    """A system in a vertical plane [m], x to the right and y up.
-
-    Attributes
-    ----------
-    lines : tuple of (n, k, 2)
-        Polylines of k points, for each of n states.
-    masses : (n, p, 2)
-        Points at which masses sit.
-    """
+class Body(NamedTuple):
+    """Polylines (n, k, 2) and masses (n, p, 2) at n states, in a vertical plane [m], y up."""
 
     lines: tuple[Array, ...]
     masses: Array
 
 
-@singledispatch
 def body(system: System, states: Array) -> Body | None:
     """Return the body of a system at states (n, d); None for one without angles and positions.
 
     Without a drawing of its own it has, 2 m apart, a rod for each angle and a block for each
     position.
     """
+    if isinstance(system, Cartpole):
+        cart = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
+        tip = cart - _rod(-states[:, 2], system.length)  # the angle is from upright
+        corners = cart[:, None] + system.length * np.array(CART) * SQUARE
+        return Body((corners, np.stack([cart, tip], axis=1)), tip[:, None])
+    if isinstance(system, Arm | Chain):
+        sides = [system.length] if isinstance(system, Chain) else [system.length_1, system.length_2]
+        rods = _rod(states[:, list(system.angle_indices)].T, np.array(sides)[:, None])
+        ends = np.cumsum(rods, axis=0).swapaxes(0, 1)
+        return Body((np.pad(ends, ((0, 0), (1, 0), (0, 0))),), ends)
+    if isinstance(system, Quadrotor):
+        centre, arm = states[:, [0, 2]], _rod(0.5 * np.pi + states[:, 4], system.half_span)
+        return Body((np.stack([centre - arm, centre + arm], axis=1),), centre[:, None])
     units = [unit_of(label) for label in system.state_labels]
     shown = [i for i, unit in enumerate(units) if unit in ("rad", "m")]
     lines, masses = [], []
     for place, i in enumerate(shown):
         rest = np.full((len(states), 2), [2.0 * place - (len(shown) - 1), 0.0])
         if units[i] == "rad":
-            masses.append(rest + _hanging(states[:, i], getattr(system, "length", 1.0)))
-            lines.append(_polyline(rest, masses[-1]))
+            masses.append(rest + _rod(states[:, i], getattr(system, "length", 1.0)))
+            lines.append(np.stack([rest, masses[-1]], axis=1))
         else:
             masses.append(rest + np.pad(states[:, i : i + 1], ((0, 0), (0, 1))))
             lines.append(masses[-1][:, None] + BLOCK * SQUARE)
-    return Body(tuple(lines), _polyline(*masses)) if shown else None
+    return Body(tuple(lines), np.stack(masses, axis=1)) if shown else None
 
 
-@body.register
-def _(system: Cartpole, states: Array) -> Body:
-    cart = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
-    tip = cart - _hanging(-states[:, 2], system.length)  # the angle is from upright
-    corners = system.length * np.array(CART) * SQUARE
-    return Body((cart[:, None] + corners, _polyline(cart, tip)), tip[:, None])
+def _rod(angle: Array, length: float | Array) -> Array:
+    """Return the ends (..., 2) of rods from the origin, at angles from hanging."""
+    return np.stack([length * np.sin(angle), -length * np.cos(angle)], axis=-1)
 
 
-@body.register
-def _(system: Car, states: Array) -> Body:
-    axis, wheel = (_hanging(0.5 * np.pi + states[:, 2] + turn, 1.0) for turn in (0.0, states[:, 6]))
-    front, rear = states[:, :2] + system.front * axis, states[:, :2] - system.rear * axis
-    half = WHEEL * system.front * wheel
-    return Body(
-        (_polyline(rear, front), _polyline(front - half, front + half)), states[:, None, :2]
-    )
-
-
-@body.register(Arm)
-@body.register(Chain)
-def _(system: Arm | Chain, states: Array) -> Body:
-    if isinstance(system, Chain):
-        lengths = [system.length] * system.n_learned
-    else:
-        lengths = [system.length_1, system.length_2]
-    pairs = zip(system.angle_indices, lengths, strict=True)
-    masses = np.cumsum([_hanging(states[:, i], length) for i, length in pairs], axis=0)
-    return Body((_polyline(0 * masses[0], *masses),), _polyline(*masses))
-
-
-@body.register
-def _(system: Quadrotor, states: Array) -> Body:
-    centre, arm = states[:, [0, 2]], _hanging(0.5 * np.pi + states[:, 4], system.half_span)
-    return Body((_polyline(centre - arm, centre + arm),), centre[:, None])
-
-
-def _hanging(angle: Array, length: float) -> Array:
-    """Return the end (n, 2) of a rod from the origin, at an angle from hanging."""
-    return length * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
-
-
-def _polyline(*points: Array) -> Array:
-    return np.stack(points, axis=1)
-
-
-@dataclass(frozen=True)
-class Story:
+class Story(NamedTuple):
     """A trial in k frames: ``steps`` done, (k,), states (T + 1, d), and losses (T,).
 
     ``truth``, (T + 1, r), and ``learned``, (k, T + 1, r), are accelerations at zero input along the
@@ -157,10 +112,8 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
     if seed not in finished:
         raise AnalysisError(f"{name} is not finished: choose by --seed one of {finished[:10]}.")
     spec = simulated_trial(config, seed)
-    states, curves = (
-        reader.trajectory(config.config_key, seed).states,
-        reader.curves(config.config_key),
-    )
+    states = reader.trajectory(config.config_key, seed).states
+    curves = reader.curves(config.config_key)
     states = states[np.isfinite(states).all(axis=1)]
     end = len(states) - 1
     if end < 1:

@@ -12,22 +12,15 @@ import hashlib
 import importlib
 import importlib.metadata
 import json
-import multiprocessing
 import os
 import platform
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures import wait as futures_wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from analysis.data.matching import AnalysisError
 from analysis.data.selection import Selection
 from analysis.stats.curves import PlotOptions
 from analysis.tables.rendering import TABLES
@@ -41,12 +34,12 @@ PACKAGE = Path(__file__).parent
 """The folder of the analysis."""
 
 _PLOTS = {
-    "figure1": ("loss_curves", "loss_plot", "loss"),
-    "figure1_reachable": ("loss_curves", "loss_plot", "reachable_loss"),
+    "figure1": ("losses", "loss_plot", "loss"),
+    "figure1_reachable": ("losses", "loss_plot", "reachable_loss"),
     "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
     "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
     "figure2_spectrum": ("phase_portraits", "spectrum_plot", "cartpole"),
-    "figure6_pareto": ("pareto", "PARETO"),
+    "figure6_pareto": ("losses", "PARETO"),
 }
 """Module, name and subject of each figure, in the order of the page."""
 
@@ -62,11 +55,6 @@ TABLE_FILES = ("md", "tex", "csv")
 PAGE = "README.md"
 
 PICTURES = ("pdf", "svg", "png")
-
-INTERRUPT_INTERVAL = 0.1
-"""Seconds between two looks for Ctrl-C."""
-
-T = TypeVar("T")
 
 
 @functools.cache
@@ -87,18 +75,6 @@ class Outcome:
     state: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Task:
-    """An output that is to be written: its trials, its provenance and its fingerprint."""
-
-    name: str
-    selection: Selection
-    options: PlotOptions
-    folder: Path
-    facts: Mapping[str, Any]
-    mark: str
-
-
 def build(
     reader: Reader,
     selection: Selection,
@@ -107,79 +83,68 @@ def build(
     names: tuple[str, ...] = NAMES,
     *,
     force: bool = False,
-    workers: int = 1,
 ) -> Iterator[Outcome]:
-    """Write the named outputs and the page of all into a folder; say of each what happened.
-
-    ``workers`` outputs are written at a time, each in its own process if there are several.
-    """
+    """Write the named outputs and the page of all into a folder; say of each what happened."""
     make_folder(folder)
-    planned = {name: _plan(name, reader, selection, options, folder, force) for name in names}
-    tasks = {name: one for name, one in planned.items() if isinstance(one, Task)}
-    with written(_write_output, reader, tasks, workers) as write:
-        for name, one in planned.items():
-            if isinstance(one, str):
-                yield Outcome(name, one)
-            else:
-                write(name)
-                yield Outcome(name, "written")
+    for name in names:
+        part = selection if name in WITH_EXPLORATIONS else selection.simulated()
+        yield Outcome(name, _made(reader, part, options, folder, name, force=force))
     if write_page(folder, (*TABLES, *FIGURES)):
         yield Outcome(PAGE, "written")
 
 
-def _plan(
-    name: str,
+def _made(
     reader: Reader,
     selection: Selection,
     options: PlotOptions,
     folder: Path,
+    name: str,
+    *,
     force: bool,
-) -> Task | str:
-    """Return what is to be written, or why nothing is."""
-    if name not in WITH_EXPLORATIONS:
-        selection = selection.simulated()
-    kind = plots()[name] if name in FIGURES else TABLES[name]
-    part = kind.part(selection, options)
+) -> str:
+    """Write an output where it is not as it would be written; return what happened."""
+    is_figure = name in FIGURES
+    part = (plots() if is_figure else TABLES)[name].part(selection, options)
     if not part.entries:
         return "not drawn, nothing is stored for it"
     facts = describe(reader, part) | {"request": options.as_dict(), "name": name}
     # Where the data lie and which commit was checked out is no part of the fingerprint.
     marked = ("selection", "request", "versions", "name", "notes")
     mark = fingerprint({key: facts[key] for key in marked} | {"code": code_hash()})
-    endings = (*PICTURES, "csv", "txt") if name in FIGURES else TABLE_FILES
+    endings = (*PICTURES, "csv", "txt") if is_figure else TABLE_FILES
     if not force and is_current(folder, name, endings, mark):
         return "unchanged"
-    return Task(name, part, options, folder, facts, mark)
+    words = (_draw if is_figure else _tabulate)(reader, part, options, folder, name, mark)
+    write_provenance({**facts, **words, "fingerprint": mark}, folder, name)
+    return "written"
 
 
-def _write_output(reader: Reader, task: Task) -> None:
-    words = (_draw if task.name in FIGURES else _tabulate)(reader, task)
-    facts = {**task.facts, **words, "fingerprint": task.mark}
-    write_provenance(facts, task.folder, task.name)
-
-
-def _draw(reader: Reader, task: Task) -> dict[str, str]:
+def _draw(
+    reader: Reader, selection: Selection, options: PlotOptions, folder: Path, name: str, mark: str
+) -> dict[str, str]:
     from analysis.figures.panels import styled
 
-    name, plot, folder = task.name, plots()[task.name], task.folder
+    plot = plots()[name]
     with styled():
-        drawing = plot.make(reader, task.selection, task.options)
+        drawing = plot.make(reader, selection, options)
         caption = drawing.caption
-        if task.selection.gaps:
-            warning = partial_warning(task.selection)
+        if selection.gaps:
+            warning = partial_warning(selection)
             caption = f"{warning} {caption}"
             drawing.figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
-        write_pictures(drawing.figure, folder, name, plot.title, task.mark)
+        write_pictures(drawing.figure, folder, name, plot.title, mark)
     write_table(drawing.table, folder, name)
     write_text(caption + "\n", folder / f"{name}.txt")
-    return plot.words(task.options) | {"caption": caption}
+    return plot.words(options) | {"caption": caption}
 
 
-def _tabulate(reader: Reader, task: Task) -> dict[str, str]:
-    name, folder, kind = task.name, task.folder, TABLES[task.name]
-    table = kind.measure(reader, task.selection, task.options)
-    text_table = kind.render(table, task.options)
-    warning = f"{partial_warning(task.selection)}\n\n" if task.selection.gaps else ""
+def _tabulate(
+    reader: Reader, selection: Selection, options: PlotOptions, folder: Path, name: str, _: str
+) -> dict[str, str]:
+    kind = TABLES[name]
+    table = kind.measure(reader, selection, options)
+    text_table = kind.render(table)
+    warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
     write_table(table, folder, name)
     write_text(warning + text_table.markdown(), folder / f"{name}.md")
     comment = f"% {warning.rstrip()}\n" if warning else ""
@@ -374,83 +339,3 @@ def write_text(text: str, target: Path) -> None:
     """Write a file whole or not at all."""
     with whole(target) as part:
         part.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def written(
-    write: Callable[[Reader, T], None], reader: Reader, tasks: Mapping[str, T], workers: int
-) -> Iterator[Callable[[str], None]]:
-    """Yield a function that returns when the task of a name is written, by one of ``workers``.
-
-    With one worker or one task it writes in this process. Several are forks of it, which import
-    nothing again, and each opens the database for itself. The function raises what ``write`` does,
-    ``AnalysisError`` if a process was killed, and ``KeyboardInterrupt`` after Ctrl-C.
-    """
-    processes = min(workers, len(tasks))
-    if processes < 2:
-        yield lambda name: write(reader, tasks[name])
-        return
-    context = multiprocessing.get_context("fork")
-    with (
-        _deferred_interrupt() as raise_interrupt,
-        ProcessPoolExecutor(processes, context, _ignore_interrupt) as pool,
-    ):
-        try:
-            futures = {
-                name: pool.submit(_write_apart, write, reader.url, tasks[name]) for name in tasks
-            }
-        except (OSError, RuntimeError):  # no further process or thread
-            for process in multiprocessing.active_children():
-                process.kill()  # it would wait for work for ever
-            raise
-
-        def wait(name: str) -> None:
-            raise_interrupt()
-            while not futures_wait([futures[name]], timeout=INTERRUPT_INTERVAL).done:
-                raise_interrupt()
-            try:
-                futures[name].result()
-            except BrokenProcessPool as error:
-                raise AnalysisError(
-                    f"A process was killed before {name} was written, perhaps as memory ran "
-                    f"out: give --workers 1."
-                ) from error
-
-        try:
-            yield wait
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _write_apart(write: Callable[[Reader, T], None], url: str, task: T) -> None:
-    with Reader.open(url) as reader:
-        write(reader, task)
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], None]]:
-    """Yield a function that raises ``KeyboardInterrupt`` if Ctrl-C came; nothing else does.
-
-    Raised at once, it could come between two statements of the pool that hold its locks. Threads
-    other than the main one never get it.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: None
-        return
-    received: list[int] = []
-
-    def raise_interrupt() -> None:
-        if received:
-            raise KeyboardInterrupt
-
-    previous = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
-    try:
-        yield raise_interrupt
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    raise_interrupt()
-
-
-def _ignore_interrupt() -> None:
-    """Leave Ctrl-C, which the whole group of processes gets, to the first of them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -131,7 +131,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         gaps = [gap for group in found for gap in _gaps(group)]
         if gaps and not options.allow_partial:
             raise incomplete(gaps, "but all that are registered are", "--env, --policy and --where")
-        table = adjust([tabulate_group(moment, group, options.diverged) for group in found])
+        table = adjust([tabulate_group(moment, group) for group in found])
         controlled = tabulate_control_of(moment, found)
         selection = Selection(tuple(one for group in found for one in group.variants))
         facts = outputs.describe(moment, selection)

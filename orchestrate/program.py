@@ -40,6 +40,10 @@ _INSTALLED = {
 SUCCESSORS = {
     "analysis --band": "v_trial has every final loss, of which SQL or pandas give quantiles",
     "analysis --figures": "open README.md in the folder of figures",
+    "analysis --color-by": "the first setting of --group-by decides about the colours of figure 1",
+    "analysis --diverged": "analysis.load().trials() has every final loss, for pandas' fillna",
+    "analysis --workers": "one process draws all outputs of the paper's grid in seconds",
+    "comparison_control": "python -m analysis report has a table of success and cost of control",
     "figure4_width": "python -m studies.speed.scaling q_dual prints the cost of a step",
     "figure4_width_loss": "python -m analysis summary --group-by width shows the losses",
     "figure5_control": "python -m analysis report has a table of success and cost of control",

@@ -1,4 +1,4 @@
-"""Numbers of trials: curves, rules for diverged ones, learned models; frames for a notebook.
+"""Numbers of trials: curves, learned models; frames for a notebook.
 
 import analysis
 
@@ -6,7 +6,7 @@ results = analysis.load(env="pendulum")
 results.trials()                       # one row for each trial
 results.curves("loss")                 # one row for each trial and step
 results.matrix("pendulum", "random")   # losses (seed, t)
-results.assessments("control_cost")    # one row for each trial and assessed step
+results.reader.query("SELECT * FROM v_assessment")   # rows of any SELECT
 results.model(trial).predict(states)   # learned accelerations (N, r) of a row of trials()
 """
 
@@ -16,7 +16,6 @@ import json
 import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from typing import Any, Self
 
 import numpy as np
@@ -40,7 +39,6 @@ from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
 from orchestrate.store import (
     CONFIG_COLUMNS,
-    Assessments,
     ConfigRow,
     Curves,
     Reader,
@@ -49,30 +47,17 @@ from orchestrate.store import (
 from orchestrate.store.records import stacked
 
 Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
-
-class DivergenceRule(StrEnum):
-    """How diverged trials enter a statistic.
-
-    ``EXCLUDE`` leaves them out, from the first step to the last; ``WORST`` and ``MEDIAN`` give them
-    at each step the largest and the median loss of the trials that did not diverge.
-    """
-
-    EXCLUDE = "exclude"
-    WORST = "worst"
-    MEDIAN = "median"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Curves that enter a statistic.
+    """Curves that enter a statistic: of the trials that did not diverge.
 
     Attributes
     ----------
     seeds : (n,)
     values : (n, T)
-        Finite, after the rule was applied.
+        Finite.
     n_finished : int
         Trials that ran to an end, diverged ones included.
     n_diverged : int
@@ -88,22 +73,6 @@ class Sample:
         return of_finished(len(self.values), self.n_finished, self.n_diverged)
 
 
-def apply_rule(
-    seeds: npt.NDArray[np.int64], values: Array, diverged: Mask, rule: DivergenceRule
-) -> Sample:
-    """Return the sample (n, T) that a statistic sees, of trials (N, T) with NaN past divergence.
-
-    Without a trial that survived, ``WORST`` and ``MEDIAN`` have nothing to lend and the sample is
-    empty.
-    """
-    kept = values[~diverged]
-    if rule is DivergenceRule.EXCLUDE or not len(kept) or not diverged.any():
-        return Sample(seeds[~diverged], kept, len(values), int(diverged.sum()))
-    lent = np.max(kept, axis=0) if rule is DivergenceRule.WORST else np.median(kept, axis=0)
-    filled = np.where(diverged[:, None], lent, values)
-    return Sample(seeds, filled, len(values), int(diverged.sum()))
-
-
 def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     """Return one column of the entry's finished trials.
 
@@ -117,10 +86,11 @@ def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     return Curves(curves.seeds[kept], curves.t[:n], curves.values[kept, :n], curves.diverged[kept])
 
 
-def read_sample(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Sample:
-    """Return the curves (n, T) that a statistic sees."""
+def read_sample(reader: Reader, entry: Entry, column: str) -> Sample:
+    """Return the curves (n, T) that a statistic sees: a diverged trial leaves its whole curve."""
     curves = read_curves(reader, entry, column)
-    return apply_rule(curves.seeds, curves.values, curves.diverged, rule)
+    lost = curves.diverged
+    return Sample(curves.seeds[~lost], curves.values[~lost], len(lost), int(lost.sum()))
 
 
 def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array]:
@@ -197,21 +167,14 @@ class LearnedModel:
 
         Raises
         ------
-        AnalysisError
+        SpecificationError
             If they are no numbers, or not of the shapes above.
         """
-        x = _rows(states, self.spec.system.n_states, "states")
-        single = np.ndim(states) == 1
-        u = None if inputs is None else _rows(inputs, self.spec.system.n_inputs, "inputs")
-        if u is not None and len(u) not in (1, len(x)):
-            raise AnalysisError(
-                f"inputs have {len(u)} rows and states have {len(x)}, but as many are expected: "
-                f"give one input for each state."
-            )
-        values = learned_accelerations(self.spec, self.parameters, x, u)
-        if u is not None:
+        values = learned_accelerations(self.spec, self.parameters, states, inputs)
+        if inputs is not None:
+            x, u = np.atleast_2d(states), np.atleast_2d(inputs)
             values = self._derivative(x, u, values)
-        return values[0] if single else values
+        return values[0] if np.ndim(states) == 1 else values
 
     def _derivative(self, x: Array, u: Array, accelerations: Array) -> Array:
         system = self.spec.system
@@ -219,22 +182,6 @@ class LearnedModel:
         flow = np.stack([np.broadcast_to(row, len(x)) for row in known], axis=-1).astype(float)
         flow[:, list(system.learned_rows)] += accelerations
         return flow
-
-
-def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
-    try:
-        rows = np.atleast_2d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError) as error:
-        raise AnalysisError(
-            f"{what} are {reprlib.repr(given)}, but numbers of the shape (N, {size}) or ({size},) "
-            f"are expected: give one row for each point."
-        ) from error
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise AnalysisError(
-            f"{what} have the shape {np.shape(given)}, but (N, {size}) or ({size},) is expected: "
-            f"give one row for each point."
-        )
-    return rows
 
 
 def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
@@ -261,7 +208,6 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
 
 
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
-_MEASURED = ("seed", "t", "measure", "value", "diverged")
 
 
 def read_request(env: object, policy: object, where: object) -> Filter:
@@ -421,30 +367,13 @@ class Results:
     def _tidy(self, config: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
         with self.reader.moment() as moment:
             read = {name: moment.curves(config.config_key, name) for name in columns}
+        first = next(iter(read.values()))
+        n, steps = first.values.shape
+        frame = pd.DataFrame({"seed": np.repeat(first.seeds, steps), "t": np.tile(first.t, n)})
+        frame["time"] = config.dt * frame["t"]
+        frame["diverged"] = np.repeat(first.diverged, steps)
         values = {name: column.values.ravel() for name, column in read.items()}
-        frame = _long(next(iter(read.values())))
-        frame.insert(2, "time", config.dt * frame["t"])
         return _labelled(frame.assign(**values), config)
-
-    def assessments(self, *measures: str) -> pd.DataFrame:
-        """Return one row for each finished trial, measure and number of explored steps ``t``.
-
-        By default of all measures; empty where no trial was assessed. A value that overflowed, or
-        lies past a divergence, is NaN.
-        """
-        parts = [
-            self._measured(config, measure)
-            for config in self._configs()
-            for measure in (measures or self.reader.measures(config.config_key))
-        ]
-        if not parts:
-            return pd.DataFrame(columns=[*CONFIG_COLUMNS, "config_key", *_MEASURED])
-        return pd.concat(parts, ignore_index=True)
-
-    def _measured(self, config: ConfigRow, measure: str) -> pd.DataFrame:
-        found = self.reader.assessments(config.config_key, measure)
-        frame = _long(found).assign(measure=measure, value=found.values.ravel())
-        return _labelled(frame[list(_MEASURED)], config)
 
     def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
         """Return one column of the steps of a policy in an environment as a matrix (seed, t).
@@ -517,13 +446,6 @@ class Results:
                 f"it holds {len(configs)} in all: run the grid first, or ask for less."
             )
         return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
-
-
-def _long(found: Curves | Assessments) -> pd.DataFrame:
-    """Return a row for each trial and step: its seed, t and whether the trial diverged."""
-    n, steps = found.values.shape
-    columns = {"seed": np.repeat(found.seeds, steps), "t": np.tile(found.t, n)}
-    return pd.DataFrame({**columns, "diverged": np.repeat(found.diverged, steps)})
 
 
 def _labelled(frame: pd.DataFrame, config: ConfigRow) -> pd.DataFrame:

@@ -174,10 +174,6 @@ class Selection:
     def environments(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(entry.config.env for entry in self.entries))
 
-    @property
-    def policies(self) -> tuple[str, ...]:
-        return tuple(sorted({entry.config.policy for entry in self.entries}, key=policy_rank))
-
     def of(self, environment: str) -> tuple[Entry, ...]:
         """Return the entries of one environment."""
         return tuple(entry for entry in self.entries if entry.config.env == environment)
@@ -383,20 +379,12 @@ def one_each(
     return [max(group, key=weight) for group in groups.values()]
 
 
-def unfinished(
-    entries: Iterable[Entry],
-    name: Callable[[ConfigRow], str] | None = None,
-    what: str = "trials are not finished",
-) -> Iterator[str]:
-    """Yield a sentence for each entry that has trials which are not finished.
-
-    ``name`` names a configuration, by default by its environment and the label of the entry.
-    """
+def unfinished(entries: Iterable[Entry]) -> Iterator[str]:
+    """Yield a sentence for each entry that has trials which are not finished."""
     for entry in entries:
         missing = len(entry.trials) - len(entry.finished)
         if missing:
-            own = name(entry.config) if name else f"{entry.config.env}, {entry.label}"
-            yield f"{own}: {missing} {what}"
+            yield f"{entry.config.env}, {entry.label}: {missing} trials are not finished"
 
 
 def section_text(entry: Entry, name: str) -> str:

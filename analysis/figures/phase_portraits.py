@@ -332,18 +332,10 @@ def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpec
 
 def _spectrum(reader: Reader, entry: Entry, dt: float) -> pd.DataFrame:
     key, done = entry.config.config_key, entry.final_losses()
-    found = average_spectrum(np.stack([reader.trajectory(key, seed).inputs for seed in done]), dt)
-    columns = {
-        "env": entry.config.env,
-        "policy": entry.config.policy,
-        "frequency_hz": found.frequency,
-        "mean": found.mean,
-        "quantile_10": found.low,
-        "quantile_90": found.high,
-        "n": found.n,
-        "n_diverged": len(entry.finished) - len(done),
-    }
-    return pd.DataFrame(columns)
+    inputs = np.stack([reader.trajectory(key, seed).inputs for seed in done])
+    names = {"env": entry.config.env, "policy": entry.config.policy}
+    counts = {"n": len(done), "n_diverged": len(entry.finished) - len(done)}
+    return pd.DataFrame({**names, **average_spectrum(inputs, dt), **counts})
 
 
 def spectrum_plot(env: str) -> Plot[InputSpectra]:

@@ -232,7 +232,7 @@ LOG_SECONDS = 60.0
 _next: dict[tuple[str, int], float] = {}
 """When the next warning of a place in the code is logged."""
 
-END_SECONDS = 5.0
+END_SECONDS = 5
 """Time in which open requests end after Ctrl-C."""
 
 
@@ -380,14 +380,9 @@ def seldom(record: logging.LogRecord) -> bool:
 
 
 class Server(uvicorn.Server):
-    """Server that ends event streams and statements before it waits for connections to close.
+    """Server that ends event streams before it waits for connections to close."""
 
-    ``leave`` is called where a request is still computed long after the end was asked for.
-    """
-
-    def __init__(
-        self, app: Starlette, port: int = 8000, leave: Callable[[], object] = lambda: None
-    ) -> None:
+    def __init__(self, app: Starlette, port: int = 8000) -> None:
         config = uvicorn.Config(
             app,
             port=port,
@@ -397,22 +392,13 @@ class Server(uvicorn.Server):
             http=Connection,
             ws="none",
             limit_concurrency=MAX_CONNECTIONS,
+            timeout_graceful_shutdown=END_SECONDS,
         )
         super().__init__(config)
         logging.getLogger("uvicorn.error").addFilter(seldom)
         self._app = app
-        self._leave = leave
-        self._others = set(threading.enumerate())
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End what is open."""
         self._app.state.end()
-        last = threading.Timer(END_SECONDS, self._leave_requests)
-        last.daemon = True
-        last.start()
         await super().shutdown(sockets)
-
-    def _leave_requests(self) -> None:
-        busy = self.server_state.connections or self.server_state.tasks
-        if busy or any(not one.daemon for one in {*threading.enumerate()} - self._others):
-            self._leave()

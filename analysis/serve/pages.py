@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import AnalysisError, latest
-from analysis.data.samples import DivergenceRule, bounded_states
+from analysis.data.samples import bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
 from analysis.serve.web import NotFoundError, QueryParams, ServerState, read_progress, truncated
 from analysis.stats.curves import (
@@ -293,7 +293,6 @@ def choices(state: ServerState, params: QueryParams) -> Content:
     return {
         "env": params.choice("env", stored, next(iter(stored), "")),
         "environments": {env: _widths(configs) for env, configs in stored.items()},
-        "rules": list(DivergenceRule),
     }
 
 
@@ -343,10 +342,7 @@ def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple
         )
     selection = state.select(reader, params.filter(env))
     column = params.choice("column", LOSSES, "loss")
-    options = PlotOptions(
-        params.member("diverged", DivergenceRule, DivergenceRule.EXCLUDE),
-        params.member("x", Axis, Axis.STEPS),
-    )
+    options = PlotOptions(params.member("x", Axis, Axis.STEPS))
 
     def measured(part: Selection) -> LossCurve:
         """Return a curve without the values of its trials, which the pages do not show."""

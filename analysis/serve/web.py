@@ -39,8 +39,6 @@ FOLDER = Path(__file__).parent
 LARGEST = 2**31 - 1
 """Largest integer; both databases accept it for every integer column."""
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
 
 class RequestError(AnalysisError):
     """A query parameter has an invalid value."""
@@ -166,17 +164,6 @@ def numeral(value: Any, digits: int = 4) -> str:
     return number(float(value), digits) if isinstance(value, float | Decimal) else str(value)
 
 
-def loss_text(loss: float | None, error: float | None) -> str:
-    """Return ``mean ± 2 SE`` of a loss, a dash without a loss."""
-    if loss is None or not math.isfinite(loss):
-        return "–"
-    if 0 < loss < 1e-3:
-        power = math.floor(math.log10(loss))
-        scaled = loss_text(loss / 10**power, None if error is None else error / 10**power)
-        return f"({scaled}) · 10{str(power).translate(_RAISED)}"
-    return plus_minus(loss, error if error is not None else math.nan)
-
-
 def moment(value: str | None) -> str:
     """Return a stored time without its fraction of a second."""
     try:
@@ -205,7 +192,7 @@ _pages = Environment(
 )
 _pages.filters.update(
     numeral=numeral,
-    loss=loss_text,
+    loss=plus_minus,
     moment=moment,
     duration=duration,
     mebibytes=lambda count: "–" if count is None else f"{count / 2**20:.0f} MiB",
@@ -330,14 +317,13 @@ class Events:
         self._reading = asyncio.Lock()
         self._end = asyncio.Event()
 
-    @property
-    def ended(self) -> bool:
-        """Whether the server ends."""
-        return self._end.is_set()
-
     def end(self) -> None:
         """End all streams, now and later."""
         self._end.set()
+
+    @property
+    def ended(self) -> bool:
+        return self._end.is_set()
 
     async def respond(self, request: Request) -> Response:
         """Return the stream."""

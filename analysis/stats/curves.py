@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import check_keys, setting_value
-from analysis.data.samples import DivergenceRule, Sample, read_sample
+from analysis.data.matching import setting_value
+from analysis.data.samples import Sample, read_sample
 from analysis.data.selection import Entry, Selection
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
 from dopt.assessment import TURN, Plane, turns, wrap
@@ -292,16 +292,13 @@ class Spread(StrEnum):
 class PlotOptions:
     """Options of the plots; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
-    ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
-    each, belong to the loss curves.
+    ``axis``, ``statistic`` and ``spread`` belong to the loss curves.
     """
 
-    rule: DivergenceRule = DivergenceRule.EXCLUDE
     axis: Axis = Axis.STEPS
     statistic: Statistic = Statistic.MEAN
     spread: Spread = Spread.BAND
     epsilon: float | None = None
-    color_by: str | None = None
 
     @property
     def interval(self) -> str:
@@ -391,19 +388,19 @@ def measure_curves(
     reader: Reader, selection: Selection, column: str, options: PlotOptions
 ) -> tuple[LossCurve, ...]:
     """Return a curve for each entry of the selection, in its order."""
-    styles = line_styles(selection, options.color_by)
+    styles = line_styles(selection)
     return tuple(
         _curve(reader, entry, styles[entry.label], column, options) for entry in selection.entries
     )
 
 
-def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, LineStyle]:
+def line_styles(selection: Selection) -> dict[str, LineStyle]:
     """Return the style of each label: of policies their own, of other settings by value.
 
-    Entries of one colour are told apart by their dashes.
+    The first setting of ``group_by`` decides about colours; entries of one colour are told apart
+    by their dashes.
     """
-    key = color_by or selection.group_by[0]
-    check_keys([key], [entry.config for entry in selection.entries])
+    key = selection.group_by[0]
     values = list(dict.fromkeys(repr(setting_value(e.config, key)) for e in selection.entries))
     used: Counter[str] = Counter()
     styles: dict[str, LineStyle] = {}
@@ -424,7 +421,7 @@ def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, 
 def _curve(
     reader: Reader, entry: Entry, style: LineStyle, column: str, options: PlotOptions
 ) -> LossCurve:
-    config, sample = entry.config, read_sample(reader, entry, column, options.rule)
+    config, sample = entry.config, read_sample(reader, entry, column)
     t = np.arange(sample.values.shape[1])
     system = system_of(config.config)
     return LossCurve(
@@ -502,17 +499,6 @@ class DrawnPlane(Plane):
         return points
 
 
-@dataclass(frozen=True)
-class Spectrum:
-    """Mean over trials and the 10 % and 90 % quantiles across them, each (F,)."""
-
-    frequency: Array
-    mean: Array
-    low: Array
-    high: Array
-    n: int
-
-
 def periodogram(inputs: Array, dt: float) -> tuple[Array, Array]:
     """Return f [Hz] and S [unit² / Hz] of inputs (n, T, m) sampled every dt seconds.
 
@@ -527,11 +513,12 @@ def periodogram(inputs: Array, dt: float) -> tuple[Array, Array]:
     return np.asarray(frequency, dtype=float), np.asarray(density, dtype=float).sum(axis=2)
 
 
-def average_spectrum(inputs: Array, dt: float) -> Spectrum:
-    """Return mean and quantiles over trials of the periodograms of inputs (n, T, m)."""
+def average_spectrum(inputs: Array, dt: float) -> dict[str, Array]:
+    """Return columns of the periodograms of inputs (n, T, m): mean and quantiles over trials."""
     frequency, density = periodogram(inputs, dt)
     low, high = np.quantile(density, QUANTILES, axis=0)
-    return Spectrum(frequency, np.mean(density, axis=0), low, high, len(density))
+    columns = {"mean": np.mean(density, axis=0), "quantile_10": low, "quantile_90": high}
+    return {"frequency_hz": frequency, **columns}
 
 
 def median_seed(losses: dict[int, float]) -> int:

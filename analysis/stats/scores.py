@@ -9,22 +9,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from analysis.data.matching import choose
-from analysis.data.samples import DivergenceRule, read_sample
-from analysis.data.selection import (
-    Entry,
-    Selection,
-    environment_rank,
-    labelled,
-    policy_rank,
-    unfinished,
-)
+from analysis.data.samples import read_sample
+from analysis.data.selection import Entry
 from analysis.stats.curves import CONFIDENCE, band, interval_of_mean
 from analysis.style import of_finished
 from orchestrate.store import Assessments, Reader
@@ -47,7 +39,7 @@ class Measure(StrEnum):
 
 @dataclass(frozen=True)
 class Scores:
-    """One number for each seed of an entry, the divergence rule applied, and counts."""
+    """One number for each seed of an entry whose trial did not diverge, and counts."""
 
     env: str
     policy: str
@@ -66,16 +58,16 @@ class Scores:
         return of_finished(len(self.by_seed), self.n_finished, self.n_diverged)
 
 
-def final_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Scores:
+def final_losses(reader: Reader, entry: Entry, column: str) -> Scores:
     """Return the loss after the last step of each trial; from the summary column where it is."""
-    if column != "loss" or rule is not DivergenceRule.EXCLUDE:
-        return _scores(reader, entry, column, rule, lambda values: values[:, -1])
+    if column != "loss":
+        return _scores(reader, entry, column, lambda values: values[:, -1])
     return _counted(entry, entry.final_losses())
 
 
-def mean_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Scores:
+def mean_losses(reader: Reader, entry: Entry, column: str) -> Scores:
     """Return the geometric mean of the loss over all steps of each trial."""
-    return _scores(reader, entry, column, rule, mean_over_steps)
+    return _scores(reader, entry, column, mean_over_steps)
 
 
 def first_passage(values: Array, threshold: float) -> Array:
@@ -102,7 +94,6 @@ def steps_to(
     reader: Reader,
     entry: Entry,
     column: str,
-    rule: DivergenceRule,
     threshold: float,
     passage: Callable[[Array, float], Array] = first_passage,
 ) -> Scores:
@@ -110,7 +101,7 @@ def steps_to(
 
     By default for the first time (:func:`first_passage`).
     """
-    return _scores(reader, entry, column, rule, lambda values: passage(values, threshold))
+    return _scores(reader, entry, column, lambda values: passage(values, threshold))
 
 
 def mean_over_steps(values: Array) -> Array:
@@ -124,10 +115,9 @@ def _scores(
     reader: Reader,
     entry: Entry,
     column: str,
-    rule: DivergenceRule,
     score: Callable[[Array], Array],
 ) -> Scores:
-    sample = read_sample(reader, entry, column, rule)
+    sample = read_sample(reader, entry, column)
     scores = score(sample.values).tolist()
     return _counted(entry, dict(zip(sample.seeds.tolist(), scores, strict=True)))
 
@@ -298,24 +288,6 @@ def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 
 Interval = tuple[float, float, float]
 """Centre, low and high."""
-
-
-def control_part(selection: Selection) -> Selection:
-    """Return the entries with a task, in each environment the task with most trials."""
-    asked = [entry for entry in selection.stored if task_of(entry)]
-    chosen: list[Entry] = []
-    for env in dict.fromkeys(entry.config.env for entry in asked):
-        own = [entry for entry in asked if entry.config.env == env]
-        most = common_task(own)
-        same = {entry.config.config_key: entry for entry in own if task_of(entry) == most}
-        configs = choose((entry.config for entry in same.values()), selection.reference)
-        chosen += [same[config.config_key] for config in configs]
-    chosen.sort(key=lambda e: (environment_rank(e.config.env), policy_rank(e.config.policy)))
-    entries = tuple(labelled(chosen))
-    notes = unfinished(
-        chosen, lambda one: f"{one.env} × {one.policy}", "trials with a task not finished"
-    )
-    return replace(selection, entries=entries, gaps=(), notes=tuple(notes), stored=entries)
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:

@@ -19,9 +19,9 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import AnalysisError, nearness
-from analysis.data.samples import DivergenceRule, sample_losses
+from analysis.data.samples import sample_losses
 from analysis.data.selection import Entry, Selection
-from analysis.stats.curves import Statistic, centre, mean, mean_columns, stratified_mean
+from analysis.stats.curves import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
     Measure,
@@ -31,16 +31,13 @@ from analysis.stats.scores import (
     compare_hitting_times,
     final_losses,
     mean_losses,
-    relative_costs,
-    scores_at,
     steps_to,
-    without_ratio,
 )
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
 BySeed = Mapping[int, float]
-Score = Callable[[Reader, Entry, str, DivergenceRule], Scores]
+Score = Callable[[Reader, Entry, str], Scores]
 
 Judged = Mapping[str, object]
 """Columns that compare a variant with its reference."""
@@ -77,7 +74,6 @@ def compare_policies(
     reader: Reader,
     selection: Selection,
     column: str = "loss",
-    rule: DivergenceRule = DivergenceRule.EXCLUDE,
     measure: Measure = Measure.FINAL,
 ) -> pd.DataFrame:
     """Return the ratio of losses, one row for each environment and variant.
@@ -88,7 +84,7 @@ def compare_policies(
     rows: list[dict[str, object]] = []
     selection = selection.simulated()
     for env in selection.environments:
-        scores = [_SCORES[measure](reader, entry, column, rule) for entry in selection.of(env)]
+        scores = [_SCORES[measure](reader, entry, column) for entry in selection.of(env)]
         rows += _rows(selection, env, scores, lambda own, other: asdict(_against(own, other, name)))
     return _adjusted(rows, selection)
 
@@ -97,7 +93,6 @@ def compare_steps(
     reader: Reader,
     selection: Selection,
     column: str = "loss",
-    rule: DivergenceRule = DivergenceRule.EXCLUDE,
     epsilon: float | None = None,
 ) -> pd.DataFrame:
     """Return who reaches the loss ε first, one row for each environment and variant.
@@ -119,12 +114,10 @@ def compare_steps(
     selection = selection.simulated()
     for env in selection.environments:
         entries = selection.of(env)
-        threshold = (
-            loss_of_random_inputs(reader, entries, column, rule) if epsilon is None else epsilon
-        )
+        threshold = loss_of_random_inputs(reader, entries, column) if epsilon is None else epsilon
         if threshold is None:
             continue
-        scores = [steps_to(reader, entry, column, rule, threshold) for entry in entries]
+        scores = [steps_to(reader, entry, column, threshold) for entry in entries]
         facts = {"epsilon": threshold, "horizon": entries[0].config.horizon}
         rows += _rows(selection, env, scores, partial(_race, facts))
     if not rows and selection.compared().entries and len(selection.entries) > 1:
@@ -136,9 +129,7 @@ def compare_steps(
     return _adjusted(rows, selection)
 
 
-def loss_of_random_inputs(
-    reader: Reader, entries: Iterable[Entry], column: str, rule: DivergenceRule
-) -> float | None:
+def loss_of_random_inputs(reader: Reader, entries: Iterable[Entry], column: str) -> float | None:
     """Return the median final loss of random inputs, None without such trials.
 
     Of several configurations the one nearest to the defaults is taken.
@@ -147,35 +138,7 @@ def loss_of_random_inputs(
     if not found:
         return None
     usual = max(found, key=lambda one: nearness(one.config))
-    return float(np.median(final_losses(reader, usual, column, rule).values))
-
-
-def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
-    """Return the ratio of the costs of control, one row for each environment, step and variant.
-
-    The cost of a trial: of the episode that its model planned, relative to the true model's.
-    ``n_lost`` pairs are in no ratio: one of the two episodes, or the true model's, has no finite
-    cost. An episode's own loss counts as the worst in the test; where the true model's was lost,
-    nothing is known.
-    """
-    rows: list[dict[str, object]] = []
-    for env in selection.environments:
-        entries = selection.of(env)
-        steps = sorted({int(t) for entry in entries for t in relative_costs(reader, entry).t})
-        for t in steps:
-            if t == 0:  # the same untrained model for all
-                continue
-            successes = {entry.label: _successes(reader, entry, t) for entry in entries}
-            scores = [scores_at(reader, entry, t) for entry in entries]
-            rows += _rows(selection, env, scores, partial(_controlled, t, successes))
-    return _adjusted(rows, selection)
-
-
-def _successes(reader: Reader, entry: Entry, t: int) -> float:
-    """Return the share of successful episodes after t explored steps, NaN for none."""
-    found = reader.assessments(entry.config.config_key, "control_success")
-    known = found.values[:, found.t == t]
-    return float(mean(known[np.isfinite(known)]))
+    return float(np.median(final_losses(reader, usual, column).values))
 
 
 def references(selection: Selection, env: str) -> Iterator[tuple[Entry, Entry, bool]]:
@@ -244,16 +207,6 @@ def _race(facts: Judged, own: Scores, reference: Scores) -> Judged:
     return {**facts, **asdict(compare_hitting_times(*paired(own.by_seed, reference.by_seed)))}
 
 
-def _controlled(t: int, successes: Mapping[str, float], own: Scores, reference: Scores) -> Judged:
-    return {
-        "t": t,
-        "success": successes[own.label],
-        "success_reference": successes[reference.label],
-        **asdict(_against(own, reference, f"control/{t}")),
-        "n_lost": without_ratio(*paired(own.by_seed, reference.by_seed)),
-    }
-
-
 def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFrame:
     if not rows:
         raise nothing_to_compare(selection)
@@ -272,9 +225,7 @@ def nothing_to_compare(selection: Selection) -> AnalysisError:
     )
 
 
-def aggregate(
-    reader: Reader, selection: Selection, rule: DivergenceRule = DivergenceRule.EXCLUDE
-) -> pd.DataFrame:
+def aggregate(reader: Reader, selection: Selection) -> pd.DataFrame:
     """Return the ratio of final losses over all systems, one row for each variant.
 
     It is the geometric mean over systems of the geometric means over shared seeds of variant /
@@ -290,7 +241,7 @@ def aggregate(
     selection = selection.simulated()
     for env in selection.environments:
         for own, reference, _ in references(selection, env):
-            ours, theirs = (final_losses(reader, one, "loss", rule) for one in (own, reference))
+            ours, theirs = (final_losses(reader, one, "loss") for one in (own, reference))
             if set(ours.by_seed) & set(theirs.by_seed):
                 found.setdefault(own.label, []).append((ours, theirs))
     if not found:
@@ -319,19 +270,17 @@ def _log_ratios(own: Scores, reference: Scores) -> Array:
     return np.where(np.isfinite(logs), logs, np.nan)
 
 
-def summarise(
-    reader: Reader, selection: Selection, rule: DivergenceRule = DivergenceRule.EXCLUDE
-) -> pd.DataFrame:
+def summarise(reader: Reader, selection: Selection) -> pd.DataFrame:
     """Return centres of the final losses, one row for each environment and policy.
 
     For both losses the mean with two standard errors, the median and the interquartile mean; and
     the mean of the sample losses where some are stored.
     """
-    return pd.DataFrame([_summary(reader, entry, rule) for entry in selection.entries])
+    return pd.DataFrame([_summary(reader, entry) for entry in selection.entries])
 
 
-def _summary(reader: Reader, entry: Entry, rule: DivergenceRule) -> dict[str, object]:
-    scores = {name: final_losses(reader, entry, name, rule) for name in ("loss", "reachable_loss")}
+def _summary(reader: Reader, entry: Entry) -> dict[str, object]:
+    scores = {name: final_losses(reader, entry, name) for name in ("loss", "reachable_loss")}
     row: dict[str, object] = {"env": entry.config.env, "policy": entry.config.policy}
     row["label"] = entry.label
     for name, found in scores.items():

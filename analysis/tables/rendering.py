@@ -17,10 +17,9 @@ from analysis.data.matching import AnalysisError, IncompleteError
 from analysis.data.samples import learned_model, sample_losses, simulated_trial
 from analysis.data.selection import Entry, Gap, Selection
 from analysis.stats.curves import STUDENT_RANGE, PlotOptions
-from analysis.stats.scores import Measure, control_part, geometric_mean
+from analysis.stats.scores import Measure, geometric_mean
 from analysis.style import (
     but_diverged,
-    but_lost,
     number,
     p_text,
     plus_minus,
@@ -31,7 +30,6 @@ from analysis.style import (
 from analysis.tables.comparisons import (
     EPSILON_POLICY,
     aggregate,
-    compare_control,
     compare_policies,
     compare_steps,
     summarise,
@@ -143,9 +141,7 @@ def ratio_text(prefix: str = "") -> Text:
     return lambda row: within(*(row[f"{prefix}{name}"] for name in ("ratio", "low", "high")))
 
 
-def _paired(
-    table: pd.DataFrame, better: str, test: str, own: Columns, first: Columns = ()
-) -> Columns:
+def _paired(table: pd.DataFrame, better: str, test: str, own: Columns) -> Columns:
     """Return the columns that all paired comparisons have around their own ones.
 
     The last ones are the share of seeds on which the variant is better, p, adjusted p, and the
@@ -153,7 +149,6 @@ def _paired(
     """
     return (
         ("env", itemgetter("env")),
-        *first,
         ("variant", itemgetter("variant")),
         (_reference(table), itemgetter("reference")),
         *own,
@@ -169,7 +164,7 @@ def sample_loss_columns(stored: bool) -> Columns:
     return [("sample loss", mean_text("sample_loss"))] if stored else []
 
 
-def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
+def summary_table(table: pd.DataFrame) -> TextTable:
     """Return the table of final losses: mean ± 2 SE, median, IQM and n."""
     columns: Columns = (
         ("env", itemgetter("env")),
@@ -184,14 +179,14 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
     )
     note = (
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
-        f"Diverged trials: {rule}."
+        "Diverged trials: exclude."
     )
     if "sample_loss" in table:
         note += " Sample loss: mean over the trials of which one is stored (analysis sample-loss)."
     return rendered(table, columns, note)
 
 
-def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.FINAL) -> TextTable:
+def comparison_table(table: pd.DataFrame, measure: Measure = Measure.FINAL) -> TextTable:
     """Return the paired comparison of losses."""
     columns = _paired(table, "improvement", "Wilcoxon", [("loss ratio [95 %]", ratio_text())])
     note = (
@@ -199,12 +194,12 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
         f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
         "pairs. P(improvement): share of seeds with the lower loss, ties half. "
         f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
-        f"Diverged trials: {rule}."
+        "Diverged trials: exclude."
     )
     return rendered(table, columns, note)
 
 
-def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
+def aggregate_table(table: pd.DataFrame) -> TextTable:
     """Return the comparison over all systems."""
     columns: Columns = (
         ("variant", itemgetter("variant")),
@@ -216,35 +211,12 @@ def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
     note = (
         f"Ratio: {_RATIO}; geometric mean over systems, each counted alike, of the geometric mean "
         "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
-        "stratified by system. Compare only rows of the same systems. "
-        f"Diverged trials: {rule}."
+        "stratified by system. Compare only rows of the same systems. Diverged trials: exclude."
     )
     return rendered(table, columns, note)
 
 
-def control_table(table: pd.DataFrame) -> TextTable:
-    """Return the paired comparison of the costs of control, with the shares of successes."""
-    own: Columns = (
-        ("success", text_of("success", share)),
-        ("success of reference", text_of("success_reference", share)),
-        ("cost ratio [95 %]", lambda row: but_lost(ratio_text()(row), row["n_lost"])),
-    )
-    steps = [("explored steps", itemgetter("t"))]
-    columns = _paired(table, "improvement", "Wilcoxon", own, steps)
-    note = (
-        "Success: share of the episodes of the variant and of the reference that succeed, planned "
-        f"by the model learned so far. Cost ratio: {_RATIO}; geometric mean over seeds of the "
-        "episode's cost; interval: paired BCa bootstrap of the log ratio, "
-        f"{STUDENT_RANGE} pairs. P(improvement): share of seeds with the "
-        f"lower cost, ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, "
-        f"{_TESTED}. Lost: pairs in no ratio, as one of the two episodes or the true model's has "
-        "no finite cost; a lost episode counts as the worst in P(improvement) and p, one "
-        "whose true model's was lost in neither. Trials that diverged before a step are left out."
-    )
-    return rendered(table, columns, note)
-
-
-def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
+def hitting_times_table(table: pd.DataFrame) -> TextTable:
     """Return the paired comparison of the steps to a loss."""
     own: Columns = (
         ("ε", text_of("epsilon", number)),
@@ -260,7 +232,7 @@ def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
         "final loss of random inputs unless --epsilon says otherwise. A trial that never gets "
         "there is censored at the horizon: later than any that does, a tie with another such. "
         "P(earlier): share of seeds on which the variant is earlier, "
-        f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: {rule}."
+        f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: exclude."
     )
     return rendered(table, columns, note)
 
@@ -301,7 +273,7 @@ class TableKind:
     title: str
     part: Callable[[Selection, PlotOptions], Selection]
     measure: Callable[[Reader, Selection, PlotOptions], pd.DataFrame]
-    render: Callable[[pd.DataFrame, PlotOptions], TextTable]
+    render: Callable[[pd.DataFrame], TextTable]
 
 
 def comparison(column: str, measure: Measure) -> TableKind:
@@ -312,18 +284,16 @@ def comparison(column: str, measure: Measure) -> TableKind:
             f"Steps to a loss, {where}",
             _raced,
             lambda reader, selection, options: compare_steps(
-                reader, selection, column, options.rule, options.epsilon
+                reader, selection, column, options.epsilon
             ),
-            lambda table, options: hitting_times_table(table, options.rule),
+            hitting_times_table,
         )
     title = "Final loss" if measure is Measure.FINAL else "Loss over the whole curve"
     return TableKind(
         f"{title} against the reference, {where}",
         _compared,
-        lambda reader, selection, options: compare_policies(
-            reader, selection, column, options.rule, measure
-        ),
-        lambda table, options: comparison_table(table, options.rule, measure),
+        lambda reader, selection, _: compare_policies(reader, selection, column, measure),
+        lambda table: comparison_table(table, measure),
     )
 
 
@@ -348,35 +318,23 @@ def _raced(selection: Selection, options: PlotOptions) -> Selection:
     )
 
 
-def _controlled(selection: Selection, _: PlotOptions) -> Selection:
-    """Return the environments with a task in which the reference and a variant were assessed."""
-    controlled = control_part(selection).compared()
-    return controlled if len(controlled.labels) > 1 else Selection(())
-
-
 TABLES = {
     "summary": TableKind(
         "Final losses",
         _whole,
-        lambda reader, selection, options: summarise(reader, selection, options.rule),
-        lambda table, options: summary_table(table, options.rule),
+        lambda reader, selection, _: summarise(reader, selection),
+        summary_table,
     ),
     "aggregate": TableKind(
         "Final loss against the reference, all systems",
         _compared,
-        lambda reader, selection, options: aggregate(reader, selection, options.rule),
-        lambda table, options: aggregate_table(table, options.rule),
+        lambda reader, selection, _: aggregate(reader, selection),
+        aggregate_table,
     ),
     "comparison": comparison("loss", Measure.FINAL),
     "comparison_auc": comparison("loss", Measure.AUC),
     "comparison_steps": comparison("loss", Measure.STEPS),
     "comparison_reachable": comparison("reachable_loss", Measure.FINAL),
-    "comparison_control": TableKind(
-        "Cost of control against the reference",
-        _controlled,
-        lambda reader, selection, _: compare_control(reader, selection),
-        lambda table, _: control_table(table),
-    ),
 }
 
 
@@ -450,7 +408,7 @@ CALIBRATION = TableKind(
     "Fit at held-out states",
     _whole,
     lambda reader, selection, _: measure_calibration(reader, selection),
-    lambda table, _: calibration_table(table),
+    calibration_table,
 )
 
 
@@ -547,7 +505,7 @@ def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
         "Final losses beside sample losses",
         _whole,
         lambda reader, selection, _: measure_sample_losses(reader, selection, say, keep),
-        lambda table, _: rendered(table, columns, SAMPLE_LOSS_NOTE),
+        lambda table: rendered(table, columns, SAMPLE_LOSS_NOTE),
     )
 
 

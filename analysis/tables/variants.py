@@ -25,7 +25,7 @@ from analysis.data.matching import (
     nearness,
     newest,
 )
-from analysis.data.samples import DivergenceRule, coverages, read_curves, sample_losses
+from analysis.data.samples import coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
     environment_rank,
@@ -216,13 +216,11 @@ def _setting(entry: Entry) -> list[str]:
     return [section_text(entry, name) for name in _SETTING]
 
 
-def tabulate_group(
-    reader: Reader, group: VariantGroup, rule: DivergenceRule = DivergenceRule.EXCLUDE
-) -> pd.DataFrame:
+def tabulate_group(reader: Reader, group: VariantGroup) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
-    found = loss_of_random_inputs(reader, group.variants, "loss", rule)
+    found = loss_of_random_inputs(reader, group.variants, "loss")
     epsilon = math.nan if found is None else found
-    scores = _scores(reader, group, epsilon, rule)
+    scores = _scores(reader, group, epsilon)
     return pd.DataFrame(
         [_variant_row(reader, group, one, scores, epsilon) for one in group.variants]
     )
@@ -248,9 +246,7 @@ def verdict(row: Row, measure: str = "loss") -> str:
     return "better" if (ratio < 1) != (measure == "coverage") else "worse"
 
 
-def _scores(
-    reader: Reader, group: VariantGroup, epsilon: float, rule: DivergenceRule
-) -> dict[str, dict[str, BySeed]]:
+def _scores(reader: Reader, group: VariantGroup, epsilon: float) -> dict[str, dict[str, BySeed]]:
     """Return the scores of each variant, by its label and by measure.
 
     ``control`` is the relative cost after the first steps of the task; ``steps`` are the inputs
@@ -262,12 +258,12 @@ def _scores(
     first = min((t for steps in tasks for t in steps if t > 0), default=0)
     return {
         one.label: {
-            "loss": final_losses(reader, one, "loss", rule).by_seed,
-            "reachable_loss": final_losses(reader, one, "reachable_loss", rule).by_seed,
-            "auc": mean_losses(reader, one, "loss", rule).by_seed,
+            "loss": final_losses(reader, one, "loss").by_seed,
+            "reachable_loss": final_losses(reader, one, "reachable_loss").by_seed,
+            "auc": mean_losses(reader, one, "loss").by_seed,
             "coverage": coverages(reader, one, plane),
             "control": scores_at(reader, one, first).by_seed if one.label in assessed else {},
-            "steps": steps_to(reader, one, "loss", rule, epsilon, last_passage).by_seed,
+            "steps": steps_to(reader, one, "loss", epsilon, last_passage).by_seed,
         }
         for one in group.variants
     }

@@ -280,7 +280,7 @@ class Explored:
 
         Inputs count in a model that reads them, such as 'affine'; without any they are 0.
         """
-        return predict(self.spec, self.parameters, states, inputs)
+        return learned_accelerations(self.spec, self.parameters, states, inputs)
 
     def free_run_error(
         self, states: npt.ArrayLike, inputs: npt.ArrayLike, steps: int = 50
@@ -398,7 +398,7 @@ class Explored:
                 f"test is {type(test).__name__}, but a pair (states, inputs) is expected: give "
                 f"both of a recorded run."
             )
-        predicted = functools.partial(predict, self.spec, parameters)
+        predicted = functools.partial(learned_accelerations, self.spec, parameters)
         states, inputs = test
         system = self._state.system
         error = free_run_error(self.spec, predicted, states, inputs, system=system)
@@ -408,34 +408,6 @@ class Explored:
         """End the launches of the saves."""
         with self._saving:
             _close(self._savers)
-
-
-def predict(
-    spec: TrialSpec,
-    parameters: Array,
-    states: npt.ArrayLike,
-    inputs: npt.ArrayLike | None = None,
-) -> Array:
-    """Return the accelerations, (N, r), that a model of given parameters has learned."""
-    system = spec.system
-    at = _rows("states", states, system.n_states)
-    u = None if inputs is None else _rows("inputs", inputs, system.n_inputs)
-    if u is not None and len(u) != len(at):
-        raise SpecificationError(
-            f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
-            f"give the input of each state."
-        )
-    return learned_accelerations(spec, parameters, at, u)
-
-
-def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
-    rows = np.atleast_2d(reals(what, given))
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise SpecificationError(
-            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
-            f"them."
-        )
-    return rows
 
 
 def _close(savers: dict[str | None, ExplorationSaver]) -> None:

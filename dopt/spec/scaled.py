@@ -18,8 +18,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
+from dopt.arguments import reals
 from dopt.control.planning import Accelerations
+from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS, GaussNewton
 from dopt.limits import Limits, names_of
 from dopt.models import MODELS
@@ -135,14 +138,41 @@ def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
 
 
 def learned_accelerations(
-    spec: TrialSpec, parameters: Array, states: Array, inputs: Array | None = None
+    spec: TrialSpec,
+    parameters: Array,
+    states: npt.ArrayLike,
+    inputs: npt.ArrayLike | None = None,
 ) -> Array:
     """Return the accelerations, (N, r), that a model has learned, in the units of the system.
 
-    States, (N, d), and inputs, (N, m), are in its units, too; ``parameters`` are of the model in
-    scaled numbers.
+    States, (N, d), and inputs, (N, m), or one for all, are in its units, too; ``parameters`` are of
+    the model in scaled numbers.
+
+    Raises
+    ------
+    SpecificationError
+        If states or inputs are no numbers, or not of these shapes.
     """
-    found = scaled(spec.system)
-    u = None if inputs is None else found.of_inputs(inputs)
-    values = spec.model.predict(found.system, parameters, found.of_states(states), u)
+    found, system = scaled(spec.system), spec.system
+    x = _rows("states", states, system.n_states)
+    u: Array | None = None
+    if inputs is not None:
+        u = _rows("inputs", inputs, system.n_inputs)
+        if len(u) not in (1, len(x)):
+            raise SpecificationError(
+                f"{len(x)} states and {len(u)} inputs were given, but as many of both are "
+                f"expected: give the input of each state."
+            )
+        u = found.of_inputs(np.broadcast_to(u, (len(x), system.n_inputs)))
+    values = spec.model.predict(found.system, parameters, found.of_states(x), u)
     return values * found.accelerations
+
+
+def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
+    rows = np.atleast_2d(reals(what, given))
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise SpecificationError(
+            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
+            f"them."
+        )
+    return rows

@@ -13,9 +13,8 @@ import pytest
 
 from analysis.cli import main
 from analysis.data.matching import Filter
-from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
-from analysis.figures.pareto import (
+from analysis.figures.losses import (
     PARETO,
     draw,
     measure_points,
@@ -121,9 +120,9 @@ def learners(tmp_path_factory: pytest.TempPathFactory) -> str:
     return address
 
 
-def points_of(url: str, rule: DivergenceRule = DivergenceRule.EXCLUDE) -> pd.DataFrame:
+def points_of(url: str) -> pd.DataFrame:
     with Reader.open(url) as reader:
-        points = measure_points(reader, pareto_part(select(reader, Filter())), rule)
+        points = measure_points(reader, pareto_part(select(reader, Filter())))
     return points.set_index(["env", "label"], drop=False)
 
 
@@ -171,10 +170,9 @@ def test_diverged_trials_are_counted_and_said(learners: str) -> None:
     assert (some.n, some.n_diverged, some.counts) == (2, 1, "2/3, 1 diverged")
     assert not none.known
     assert not none.on_front
-    words = PARETO.caption((DivergenceRule.EXCLUDE, points.reset_index(drop=True)))
+    words = PARETO.caption(points.reset_index(drop=True))
     assert "No point, as no trial has a positive final loss: quadrotor, random, adam (0/3" in words
     assert "random, adam: 2/3, 1 diverged" in words
-    assert points_of(learners, DivergenceRule.WORST).n["pendulum", "random, adam"] == 3
 
 
 def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> None:

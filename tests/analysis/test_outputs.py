@@ -5,31 +5,25 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
-import sys
-import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from analysis import outputs
 from analysis.cli import main, parser
-from analysis.data.matching import AnalysisError, Filter
+from analysis.data.matching import Filter
 from analysis.data.selection import Selection, select
-from analysis.figures.loss_curves import _title, loss_plot
-from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot, spectrum_plot
-from analysis.outputs import FIGURES, NAMES, Task, build, plots
+from analysis.figures.losses import _title, loss_plot
+from analysis.figures.phase_portraits import phase_plot, spectrum_plot
+from analysis.outputs import FIGURES, NAMES, build, plots
 from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, limited
 from tests.analysis.synthetic import fill, make_grid
 from tests.paths import ROOT
-from tests.waiting import PATIENCE_SECONDS
 
 
 def test_the_commit_belongs_to_the_code_and_not_to_a_folder_around_it(
@@ -154,30 +148,13 @@ def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:
     assert "; random in grey;" in spectrum.make(reader, grey, PlotOptions()).caption
 
 
-@pytest.mark.parametrize(
-    ("coverage", "error", "n", "words"),
-    [
-        (0.1234, 0.00021, 100, "coverage 12.340 ± 0.042 %"),
-        (0.5, 0.02, 9, "coverage 50.0 ± 4.0 %"),
-        (0.125, float("nan"), 1, "coverage 12.5 %"),
-        (float("nan"), float("nan"), 0, "coverage unknown"),
-    ],
-)
-def test_a_coverage_has_the_digits_of_its_error(
-    coverage: float, error: float, n: int, words: str
-) -> None:
-    nowhere = np.empty((0, 2))
-    portrait = Portrait("random", nowhere, np.zeros(2), False, coverage, error, n, 0)
-    assert coverage_text(portrait) == words
-
-
-def test_several_processes_write_the_same_bytes(
+def test_what_is_drawn_twice_has_the_same_bytes(
     reader: Reader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
     selection = select(reader, Filter())
-    for target, workers in (("one", 1), ("two", 2)):
-        assert make(reader, selection, tmp_path / target, workers=workers) == ["written"] * 2
+    for target in ("one", "two"):
+        assert make(reader, selection, tmp_path / target) == ["written"] * 2
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
     assert len(files) == 6 + 4 + 1
     for file in files:
@@ -187,64 +164,6 @@ def test_several_processes_write_the_same_bytes(
     list(build(reader, selection, PlotOptions(), tmp_path / "dated", QUICK[:1]))
     dated = (tmp_path / "dated" / "figure2_spectrum.pdf").read_bytes()
     assert b"/CreationDate (D:20231114" in dated
-
-
-def kill_itself(_: Reader, task: Task) -> None:
-    if task.name == QUICK[1]:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_process_that_is_killed_is_said(
-    reader: Reader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(outputs, "_write_output", kill_itself)
-    with pytest.raises(AnalysisError, match=r"was killed before .* was written, .* --workers 1"):
-        make(reader, select(reader, Filter()), tmp_path, workers=2)
-
-
-def test_an_interruption_ends_all_processes(url: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "analysis", "figures", "--db", url, "--out", str(tmp_path)]
-    for name in ("figure1", "figure1_reachable", "figure2_phase_pendulum", "figure6_pareto"):
-        command += ["--only", name]
-    with subprocess.Popen(
-        [*command, "--workers", "2"],
-        cwd=ROOT,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    ) as process:
-        assert process.stdout is not None
-        process.stdout.readline()  # the first output has been written, and others are being
-        os.killpg(process.pid, signal.SIGINT)
-        said, errors = process.communicate(timeout=PATIENCE_SECONDS)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in said + errors
-    with pytest.raises(ProcessLookupError):
-        os.killpg(process.pid, 0)
-
-
-def write_nothing(*_: object) -> None: ...
-
-
-def write_many(reader: Reader, interruption: threading.Timer) -> None:
-    """Write many tasks in two processes, with an interruption in the midst of them."""
-    tasks = {str(number): number for number in range(100)}
-    with outputs.written(write_nothing, reader, tasks, 2) as wait:
-        interruption.start()
-        try:
-            for name in tasks:
-                wait(name)
-        finally:
-            interruption.join()  # not in the next test
-
-
-def test_an_interruption_comes_whole_at_any_moment(reader: Reader) -> None:
-    """Ctrl-C within a wait for a result must not leave a lock of the pool in disorder."""
-    for delay in np.random.default_rng(0).uniform(0, 0.02, size=12):
-        interruption = threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
-        with pytest.raises(KeyboardInterrupt):
-            write_many(reader, interruption)
 
 
 def test_what_is_unchanged_is_not_drawn_again(reader: Reader, tmp_path: Path) -> None:
@@ -386,8 +305,9 @@ def test_a_wrong_request_is_one_sentence(
         (["summary", "--formt", "csv"], "'--formt' is unknown.* did you mean '--format'"),
         (["summary", "--format", "cvs"], "--format 'cvs' is unknown.* did you mean 'csv'"),
         (["summary", "--db"], "--db: expected one argument: see python -m analysis summary --help"),
-        (["figures", "--workers", "0"], "--workers is '0', a whole number above 0 is expected"),
-        (["figures", "--workers", "two"], "--workers is 'two', a whole number above 0 is expected"),
+        (["compare", "--diverged", "worst"], "'analysis --diverged' was removed: analysis.load"),
+        (["figures", "--workers", "2"], "'analysis --workers' was removed: one process draws"),
+        (["figures", "--only", "comparison_control"], "was removed: python -m analysis report"),
         (["floor", "--env", "arm"], "'analysis floor' was removed: .*dopt.fit_offline"),
         (["yardsticks"], "'analysis yardsticks' was removed: python -m studies.yardsticks"),
         (["summary", "more"], "unexpected argument 'more'"),
@@ -416,50 +336,10 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(
     assert "choose another --out" in capsys.readouterr().err
 
 
-HELPED = ("figures", "compare", "calibration", "sample-loss", "report", "serve")
-COMMANDS = [["--help"], *([name, "--help"] for name in HELPED)]
-SERVE = ["serve"]
-PROGRAM = """
-import contextlib, io, json, sys
-for name in ("starlette", "uvicorn", "jinja2", "torch", "ray", "hydra"):
-    sys.modules[name] = None
-from analysis.cli import main
-for words in json.loads(sys.argv[1]):
-    out, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
-        try:
-            code = main(words)
-        except SystemExit as end:
-            code = end.code or 0
-    print(json.dumps([code, out.getvalue(), errors.getvalue()]))
-"""
-
-
-@pytest.fixture(scope="module")
-def answers() -> dict[str, tuple[int, str, str]]:
-    """Return exit code, output and errors of each command, all run in one process."""
-    given = [*COMMANDS, SERVE]
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(given)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    lines = map(json.loads, done.stdout.splitlines())
-    return {" ".join(words): tuple(line) for words, line in zip(given, lines, strict=True)}
-
-
-@pytest.mark.parametrize("command", [" ".join(words) for words in COMMANDS])
-def test_a_command_explains_itself(command: str, answers: dict[str, tuple[int, str, str]]) -> None:
-    code, out, errors = answers[command]
-    assert (code, errors) == (0, "")
-    assert "usage" in out.lower()
-    assert "%%" not in out
-
-
-def test_the_browser_names_the_extra(answers: dict[str, tuple[int, str, str]]) -> None:
-    code, _, errors = answers["serve"]
-    assert code == 2
-    assert errors.count("\n") == 1
-    assert "pip install 'dopt-exploration[serve]'" in errors
+@pytest.mark.parametrize("name", ["figures", "compare", "calibration", "sample-loss", "report"])
+def test_a_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main([name, "--help"])
+    said = capsys.readouterr().out
+    assert "usage" in said.lower()
+    assert "%%" not in said

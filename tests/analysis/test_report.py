@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -293,58 +293,6 @@ def test_another_reference_turns_the_ratio_round(reader: Reader) -> None:
     assert turned.ratio == pytest.approx(1 / usual.ratio)
     (group,) = variant_groups(reader, replace(wanted, reference="random"))
     assert group.reference.label == "random"
-
-
-Sections = Mapping[str, Mapping[str, object]]
-
-
-def adam(rate: float) -> Sections:
-    return {"learner": {"name": "adam", "window": 1, "learning_rate": rate}}
-
-
-def ahead(**policy: object) -> Sections:
-    return {"policy": policy}
-
-
-@pytest.mark.parametrize(
-    ("policies", "more", "labels"),
-    [
-        (
-            ("d_optimal", "random"),
-            [("d_optimal", adam(1e-3)), ("d_optimal", adam(1e-4))],
-            [
-                "D-optimal",
-                "D-optimal, adam, learning_rate=0.0001",
-                "D-optimal, adam, learning_rate=0.001",
-                "random",
-            ],
-        ),
-        (
-            ("d_optimal", "lookahead"),
-            [
-                ("lookahead", ahead(lookahead=20)),
-                ("lookahead", ahead(lookahead=20, criterion="joint")),
-            ],
-            [
-                "D-optimal",
-                "look-ahead",
-                "look-ahead, criterion=joint, lookahead=20",
-                "look-ahead, lookahead=20",
-            ],
-        ),
-    ],
-)
-def test_variants_of_one_name_are_told_apart_by_all_that_is_unusual(
-    policies: tuple[str, ...],
-    more: list[tuple[str, Sections]],
-    labels: list[str],
-    tmp_path: Path,
-) -> None:
-    specs = make_grid(("pendulum",), policies, range(2), **SHORT)
-    for policy, sections in more:
-        specs += make_grid(("pendulum",), (policy,), range(2), **SHORT, **sections)
-    with filled(tmp_path, specs) as opened:
-        assert [one.label for one in variant_groups(opened, Filter())[0].variants] == labels
 
 
 def test_what_the_models_are_good_for_has_a_section(tmp_path: Path) -> None:

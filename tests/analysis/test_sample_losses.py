@@ -122,9 +122,10 @@ def test_what_is_stored_is_in_tables_report_and_browser_and_is_not_fitted_again(
     assert shown.loc["random", "sample_loss"] == pytest.approx(np.mean(own))
     assert "| sample loss" in (tmp_path / "report" / "README.md").read_text()
     with load(url, policy="random") as results:
-        found = results.assessments("sample_loss")
-    assert found["value"].to_numpy() == pytest.approx(own)
-    assert set(found["t"]) == {30}
+        rows = "SELECT t, value FROM v_assessment WHERE policy = 'random' ORDER BY seed"
+        found = results.reader.query(rows)
+    assert [row.value for row in found] == pytest.approx(own)
+    assert {row.t for row in found} == {30}
     with TestClient(create_app(url, "127.0.0.1"), base_url="http://127.0.0.1:8000") as client:
         rows = client.get("/api/trials?policy=random&sort=sample_loss").json()["rows"]
         cells = client.get("/api/grid").json()["environments"][0]["rows"][0]["cells"]

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,7 +25,6 @@ from analysis.data.matching import (
     difference,
     newest,
 )
-from analysis.data.samples import DivergenceRule, apply_rule
 from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, select
 from analysis.tables.comparisons import compare_policies, references
 from dopt import registry
@@ -67,11 +65,6 @@ def test_the_setting_with_most_trials_of_the_reference_decides_for_all_policies(
     assert {entry.config_key for entry in chosen} == {usual.config_key, random.config_key}
 
 
-def test_the_oracle_comes_with_its_own_model() -> None:
-    usual, oracle = config("pendulum", "d_optimal"), config("pendulum", "oracle")
-    assert choice((usual, 5), (oracle, 9)) == [usual, oracle]
-
-
 def test_another_world_is_never_mixed_in() -> None:
     usual = config("pendulum", "d_optimal")
     oracle = config("pendulum", "oracle", env={"gamma": 3.0})
@@ -96,31 +89,6 @@ def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
     far = config("pendulum", "lookahead", policy={"lookahead": 20})
     assert choice((far, 5), (assessed, 5)) == [assessed]
     assert choice((assessed, 5), (plain, 5), (far, 5)) == [plain]
-
-
-def test_policies_under_other_limits_are_never_mixed_in() -> None:
-    rail = {"bounds": {"y": [-2.0, 2.0]}}
-    kinds = {
-        "none": {},
-        "counted": {"limits": {**rail, "enforced": False}},
-        "enforced": {"limits": {**rail, "enforced": True}},
-    }
-    stored = {
-        (policy, kind): config("cartpole", policy, **limits)
-        for policy in ("d_optimal", "random", "oracle")
-        for kind, limits in kinds.items()
-    }
-
-    def chosen(**trials: int) -> set[str]:
-        pool = [replace(one, n_done=trials.get(kind, 0)) for (_, kind), one in stored.items()]
-        kept = {one.config_key for one in choose([one for one in pool if one.n])}
-        return {kind for (_, kind), one in stored.items() if one.config_key in kept}
-
-    assert chosen(none=5, counted=5, enforced=5) == {"none"}
-    assert chosen(counted=5, enforced=5) == {"enforced"}
-    assert chosen(none=3, counted=5) == {"counted"}
-    reference, oracle = stored["d_optimal", "enforced"], stored["oracle", "none"]
-    assert choice((reference, 5), (oracle, 9)) == [reference]
 
 
 def test_between_learners_with_equal_trials_the_usual_one_decides() -> None:
@@ -171,14 +139,6 @@ def test_filter_by_value() -> None:
 
 def test_a_condition_says_nothing_of_a_model_without_the_value() -> None:
     assert Filter(where={"model.width": 64}).accepts(config("pendulum", "oracle"))
-
-
-def test_a_condition_that_nothing_meets_is_a_sentence() -> None:
-    configs = [config("pendulum", "oracle"), config("pendulum", "random")]
-    with pytest.raises(AnalysisError, match=r"model\.with names no value .* model\.width"):
-        Filter(where={"model.with": 16}).check_where(configs)
-    with pytest.raises(AnalysisError, match=r"model\.width=9 fits no .* stored are 16"):
-        Filter(where={"model.width": 9}).check_where(configs)
 
 
 OLD, NEW = "a" * 16, "b" * 16
@@ -269,7 +229,6 @@ def test_a_complete_grid_has_no_gap_though_periodic_cannot_fly(reader: Reader) -
     selection = select(reader, Filter())
     assert selection.gaps == ()
     assert selection.environments == ("pendulum", "cartpole", "quadrotor")
-    assert selection.policies == ("d_optimal", "oracle", "uniform", "periodic", "random")
     assert [entry.config.policy for entry in selection.of("quadrotor")] == [
         "d_optimal",
         "oracle",
@@ -476,46 +435,10 @@ def test_a_setting_that_nothing_has_is_a_sentence(bounds: Reader) -> None:
         select(bounds, Filter(group_by=("env.gama",)))
 
 
-def test_figure_1_is_coloured_by_the_setting(bounds_url: str, tmp_path: Path) -> None:
-    grouped = ["--group-by", "policy", "env.gamma", "--color-by", "env.gamma"]
+def test_outputs_are_grouped_by_settings(bounds_url: str, tmp_path: Path) -> None:
+    grouped = ["--group-by", "policy", "env.gamma"]
     only = ["--only", "figure1", "--only", "summary", "--out", str(tmp_path)]
     assert main(["figures", "--db", bounds_url, *only, *grouped]) == 0
     table = (tmp_path / "figure1.csv").read_text().splitlines()
     assert {line.split(",")[2] for line in table[1:]} == {'"D-optimal', '"random'}
     assert "| random, γ=10 |" in " ".join((tmp_path / "summary.md").read_text().split())
-
-
-NAN = np.nan
-SEEDS = np.array([0, 1, 2, 3])
-VALUES = np.array([[4.0, 2.0], [6.0, 8.0], [5.0, NAN], [5.0, 5.0]])
-DIVERGED = np.array([False, False, True, False])
-
-
-def test_a_diverged_trial_leaves_its_whole_curve() -> None:
-    sample = apply_rule(SEEDS, VALUES, DIVERGED, DivergenceRule.EXCLUDE)
-    assert sample.seeds.tolist() == [0, 1, 3]
-    assert sample.values.tolist() == [[4, 2], [6, 8], [5, 5]]
-    assert sample.describe() == "3/4, 1 diverged"
-
-
-@pytest.mark.parametrize(
-    ("rule", "lent"), [(DivergenceRule.WORST, [6, 8]), (DivergenceRule.MEDIAN, [5, 5])]
-)
-def test_the_others_lend_a_value_at_every_step(rule: DivergenceRule, lent: list[float]) -> None:
-    sample = apply_rule(SEEDS, VALUES, DIVERGED, rule)
-    assert sample.values[2].tolist() == lent
-    assert np.array_equal(sample.values[[0, 1, 3]], VALUES[[0, 1, 3]])
-    assert sample.n_diverged == 1
-
-
-@pytest.mark.parametrize("rule", list(DivergenceRule))
-def test_without_survivors_the_sample_is_empty(rule: DivergenceRule) -> None:
-    sample = apply_rule(SEEDS, VALUES, np.full(4, True), rule)
-    assert sample.values.shape == (0, 2)
-    assert sample.describe() == "0/4, 4 diverged"
-
-
-def test_without_divergence_the_count_is_a_number() -> None:
-    kept = ~DIVERGED
-    sample = apply_rule(SEEDS[kept], VALUES[kept], DIVERGED[kept], DivergenceRule.WORST)
-    assert sample.describe() == "3"

@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from analysis.data.matching import AnalysisError, Filter
-from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
 from analysis.stats.curves import (
     BAND_RESAMPLES,
@@ -37,12 +36,10 @@ from analysis.stats.scores import (
     compare_hitting_times,
     first_passage,
     last_passage,
-    mean_losses,
     mean_over_steps,
     on_front,
     sign_test,
     signed_rank,
-    steps_to,
     without_ratio,
 )
 from analysis.tables.comparisons import compare_policies, compare_steps
@@ -235,26 +232,6 @@ def test_a_median_past_the_horizon_is_censored() -> None:
     assert math.isnan(censored_median(np.empty(0)))
 
 
-def test_scores_follow_from_the_stored_curves(reader: Reader) -> None:
-    (entry,) = select(reader, Filter(("pendulum",), ("uniform",))).entries
-    curves = np.array([curve("pendulum", "uniform", seed) for seed in SEEDS])
-    arguments = (reader, entry, "loss", DivergenceRule.EXCLUDE)
-    np.testing.assert_allclose(
-        mean_losses(*arguments).values, np.exp(np.mean(np.log(curves), axis=1))
-    )
-    middle = float(np.median(curves))
-    np.testing.assert_array_equal(
-        steps_to(*arguments, middle).values, first_passage(curves, middle)
-    )
-
-
-def test_a_diverged_trial_is_left_out_of_the_scores_and_counted(reader: Reader) -> None:
-    (entry,) = select(reader, Filter(("cartpole",), ("random",))).entries
-    scores = mean_losses(reader, entry, "loss", DivergenceRule.EXCLUDE)
-    assert sorted(scores.by_seed) == [0, 1, 3, 4]
-    assert scores.describe() == "4/5, 1 diverged"
-
-
 def test_the_area_compares_whole_curves(reader: Reader) -> None:
     selection = select(reader, Filter(("pendulum",), ("d_optimal", "random")))
     row = compare_policies(reader, selection, measure=Measure.AUC).iloc[0]
@@ -279,7 +256,7 @@ def test_an_epsilon_that_nobody_reaches_is_a_tie(reader: Reader) -> None:
     selection = select(reader, Filter(("pendulum",), ("d_optimal", "periodic")))
     table = compare_steps(reader, selection, epsilon=1e-9)
     assert (table.improvement.item(), table.p_value.item()) == (0.5, 1.0)
-    assert "> 60" in hitting_times_table(table, "exclude").markdown()
+    assert "> 60" in hitting_times_table(table).markdown()
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -1.0, INF, math.nan])
@@ -295,7 +272,7 @@ def test_without_random_inputs_an_epsilon_is_needed(reader: Reader) -> None:
 
 
 def test_a_table_in_latex_needs_no_package(reader: Reader) -> None:
-    table = hitting_times_table(compare_steps(reader, select(reader, Filter())), "exclude")
+    table = hitting_times_table(compare_steps(reader, select(reader, Filter())))
     text = table.latex()
     lines = [line for line in text.splitlines() if not line.startswith("%")]
     assert text.isascii()

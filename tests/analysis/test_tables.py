@@ -14,13 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-import analysis
 from analysis.cli import main
-from analysis.data.matching import AnalysisError, Filter
-from analysis.data.samples import DivergenceRule
-from analysis.data.selection import Selection, select
+from analysis.data.matching import Filter
+from analysis.data.selection import select
 from analysis.figures.phase_portraits import measure_spectra, spectrum_caption
-from analysis.outputs import build
 from analysis.report import CAPTION, EXPLAINED
 from analysis.stats.curves import (
     Axis,
@@ -33,16 +30,14 @@ from analysis.stats.curves import (
 )
 from analysis.stats.scores import (
     Measure,
-    control_part,
     relative_costs,
     scores_at,
-    task_of,
     true_model,
 )
-from analysis.style import number, p_text, plus_minus
-from analysis.tables.comparisons import compare_control, compare_policies, summarise
-from analysis.tables.rendering import comparison_table, control_table, summary_table
-from analysis.tables.variants import TRUTH, VariantGroup, tabulate_control_of
+from analysis.style import number, p_text, percent_text, plus_minus
+from analysis.tables.comparisons import compare_policies, summarise
+from analysis.tables.rendering import comparison_table, summary_table
+from analysis.tables.variants import VariantGroup, tabulate_control_of, variant_groups
 from dopt.assessment import TURN, turns, wrap
 from dopt.offline_fit import held_out_fit
 from dopt.result import Assessment
@@ -50,7 +45,6 @@ from dopt.run import run_trial
 from orchestrate.store import Assessments, Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import (
-    Edit,
     fake_result,
     fill,
     filled,
@@ -80,15 +74,12 @@ def test_summary_follows_from_the_trials(reader: Reader) -> None:
     assert row.n == 5
 
 
-def test_a_diverged_trial_is_left_out_counted_or_the_worst(reader: Reader) -> None:
+def test_a_diverged_trial_is_left_out_and_counted(reader: Reader) -> None:
     selection = select(reader, Filter(("cartpole",), ("random",)))
     losses = [final("cartpole", "random", seed) for seed in SEEDS if seed != 2]
     left_out = summarise(reader, selection).iloc[0]
     assert (left_out.n, left_out.n_diverged) == (4, 1)
     assert left_out.loss == pytest.approx(np.mean(losses))
-    worst = summarise(reader, selection, DivergenceRule.WORST).iloc[0]
-    assert worst.n == 5
-    assert worst.loss == pytest.approx(np.mean([*losses, max(losses)]))
 
 
 def test_comparison_pairs_the_seeds(reader: Reader) -> None:
@@ -116,11 +107,6 @@ def test_a_row_does_not_depend_on_the_others(reader: Reader) -> None:
     assert same[columns].to_numpy().tolist() == part[columns].to_numpy().tolist()
 
 
-def test_nothing_to_compare_is_a_sentence(reader: Reader) -> None:
-    with pytest.raises(AnalysisError, match="only random is selected"):
-        compare_policies(reader, select(reader, Filter(policies=("random",))))
-
-
 def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
     selection = select(reader, Filter(("pendulum",), ("random",)))
     table = tabulate_curves(measure_curves(reader, selection, "loss", PlotOptions()))
@@ -145,6 +131,9 @@ def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
         (plus_minus(4.021e-5, 6.2e-6), "(4.02 ± 0.62)e-05"),
         (plus_minus(2.0, math.nan), "2.00"),
         (plus_minus(math.nan, math.nan), "–"),
+        (percent_text(0.1234, 0.00021, 100), "12.340 ± 0.042 %"),
+        (percent_text(0.125, math.nan, 1), "12.5 %"),
+        (percent_text(math.nan, math.nan, 0), ""),
         (number(0.5), "0.500"),
         (number(1234.0), "1230"),
         (number(0.0123456), "0.0123"),
@@ -171,8 +160,8 @@ def test_markdown_shows_counts_and_dashes() -> None:
         **nothing,
     }
     table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
-    assert "Student's below 30 and above 2000 pairs" in comparison_table(table, "exclude").note
-    line = comparison_table(table, "exclude").markdown().splitlines()[2]
+    assert "Student's below 30 and above 2000 pairs" in comparison_table(table).note
+    line = comparison_table(table).markdown().splitlines()[2]
     assert [field.strip() for field in line.strip("|").split("|")] == [
         "arm", "random", "D-optimal", "–", "–", "–", "–", "0, 3 diverged",
     ]  # fmt: skip
@@ -182,16 +171,15 @@ def test_markdown_shows_counts_and_dashes() -> None:
         for part, value in (("", 1.0), ("_2se", 0.1), ("_median", 0.9), ("_iqm", 0.95))
     }
     counts = {"env": "arm", "policy": "random", "label": "random", "n": 98, "n_diverged": 2}
-    summary = summary_table(pd.DataFrame([counts | values]), "worst").markdown()
+    summary = summary_table(pd.DataFrame([counts | values])).markdown()
     assert "1.00 ± 0.10" in summary
-    assert "Diverged trials: worst." in summary
+    assert "Diverged trials: exclude." in summary
 
 
 def test_every_caption_says_what_is_divided_by_what() -> None:
     for note in (
-        comparison_table(pd.DataFrame(), "exclude").note,
-        comparison_table(pd.DataFrame(), "exclude", Measure.AUC).note,
-        control_table(pd.DataFrame()).note,
+        comparison_table(pd.DataFrame()).note,
+        comparison_table(pd.DataFrame(), Measure.AUC).note,
     ):
         assert "atio: variant / reference, below 1 the variant is better" in note
     explained = " ".join(EXPLAINED)
@@ -251,30 +239,21 @@ def test_a_database_without_a_finished_trial_is_refused(
 
 
 @pytest.fixture
-def part(reader: Reader) -> Selection:
-    return control_part(select(reader, Filter()))
+def group(reader: Reader) -> VariantGroup:
+    return variant_groups(reader, Filter(("pendulum",)))[0]
 
 
-def control_of(reader: Reader, part: Selection, env: str) -> pd.DataFrame:
+def control_of(reader: Reader, group: VariantGroup) -> pd.DataFrame:
     """Return the rows of the table of control of an environment, by policy."""
-    group = VariantGroup(env, part.of(env), task=task_of(part.of(env)[0]))
     table = tabulate_control_of(reader, [group])
     assert table is not None
     names = {one.label: one.config.policy for one in group.variants}
     return table.assign(policy=table["variant"].map(names)).set_index("policy")
 
 
-def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> None:
-    assert part.environments == ("pendulum", "quadrotor")
-    assert part.policies == ("d_optimal", "uniform", "random")
-    assert all(entry.config.config["task"] for entry in part.entries)
-    whole = select(reader, Filter())
-    assert not any("task" in entry.config.config for entry in whole.entries)
-
-
-def test_the_numbers_follow_from_the_trials(reader: Reader, part: Selection) -> None:
-    curve = control_of(reader, part, "pendulum").loc["uniform"].set_index("t")
-    entry = next(e for e in part.of("pendulum") if e.config.policy == "uniform")
+def test_the_numbers_follow_from_the_trials(reader: Reader, group: VariantGroup) -> None:
+    curve = control_of(reader, group).loc["uniform"].set_index("t")
+    (entry,) = (one for one in group.assessed if one.config.policy == "uniform")
     task = entry.config.config["task"]
     specs = make_grid(("pendulum",), ("uniform",), range(5), **SHORT, task=task)
     rows = [fake_result(spec).assessments for spec in specs]
@@ -290,20 +269,21 @@ def test_the_numbers_follow_from_the_trials(reader: Reader, part: Selection) -> 
 @pytest.mark.parametrize(
     "measure",
     [
-        lambda reader, part: control_of(reader, part, "pendulum")["cost"].to_numpy(),
-        lambda reader, part: relative_costs(reader, part.entries[0]).values,
-        lambda reader, part: list(scores_at(reader, part.entries[0], 20).by_seed.items()),
-        lambda reader, part: list(true_model(reader, part.entries).values()),
+        lambda reader, group: control_of(reader, group)["cost"].to_numpy(),
+        lambda reader, group: relative_costs(reader, group.reference).values,
+        lambda reader, group: list(scores_at(reader, group.reference, 20).by_seed.items()),
+        lambda reader, group: list(true_model(reader, group.variants).values()),
     ],
 )
 def test_what_is_finished_during_a_read_is_not_in_a_part_of_it(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    measure: Callable[[Reader, Selection], object],
+    measure: Callable[[Reader, VariantGroup], object],
 ) -> None:
-    address, task = f"sqlite:///{tmp_path}/live.db", {"name": "control", "checkpoints": [20]}
-    specs = make_grid(("pendulum",), ("random",), range(6), **SHORT, task=task)
-    fill(address, specs, skipped=specs[2:])
+    address = f"sqlite:///{tmp_path}/live.db"
+    specs = make_grid(("pendulum",), ("d_optimal",), range(6), **SHORT, **TASK)
+    other = make_grid(("pendulum",), ("random",), range(2), **SHORT)
+    fill(address, [*specs, *other], skipped=specs[2:])
     read, left = Reader.assessments, [spec for spec in specs[2:] if spec.seed % 2]
 
     def assessments(self: Reader, config_key: str, measure: str) -> Assessments:
@@ -313,11 +293,11 @@ def test_what_is_finished_during_a_read_is_not_in_a_part_of_it(
         return found
 
     with Reader.open(address) as reader:
-        part = control_part(select(reader, Filter()))
-        expected = measure(reader, part)
+        (group,) = variant_groups(reader, Filter())
+        expected = measure(reader, group)
         fill(address, specs[2::2])  # between the selection and the read
         monkeypatch.setattr(Reader, "assessments", assessments)
-        np.testing.assert_array_equal(measure(reader, part), expected)
+        np.testing.assert_array_equal(measure(reader, group), expected)
     assert len(left) < 2
 
 
@@ -325,8 +305,8 @@ def _value(rows: tuple[Assessment, ...], t: int, measure: str) -> float:
     return next(row.value for row in rows if (row.t, row.measure) == (t, measure))
 
 
-def test_wilson_intervals_equal_the_textbook(reader: Reader, part: Selection) -> None:
-    curve = control_of(reader, part, "pendulum").loc["d_optimal"]
+def test_wilson_intervals_equal_the_textbook(reader: Reader, group: VariantGroup) -> None:
+    curve = control_of(reader, group).loc["d_optimal"]
     first, last = (curve.iloc[place] for place in (0, -1))
     assert (first["success"], last["success"]) == (0.0, 1.0)
     z = 1.959963985
@@ -335,130 +315,16 @@ def test_wilson_intervals_equal_the_textbook(reader: Reader, part: Selection) ->
     assert (last["success_low"], last["success_high"]) == pytest.approx((1 - edge, 1))
 
 
-def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
-    table = compare_control(reader, part)
-    assert sorted(set(table.t)) == [20, 40, 60]
-    row = table[(table.env == "quadrotor") & (table.t == 40) & (table.policy == "random")]
-    entries = {entry.config.policy: entry for entry in part.of("quadrotor")}
-    ours, theirs = (
-        scores_at(reader, entries[name], 40).by_seed for name in ("d_optimal", "random")
-    )
-    ratios = [np.log(theirs[seed] / ours[seed]) for seed in range(5)]
-    assert row.ratio.item() == pytest.approx(np.exp(np.mean(ratios)))
-    assert row.n_pairs.item() == 5
-    assert row.improvement.item() == 0.0
-    sheet = control_table(table)
-    assert len(sheet.rows) == len(table) == 2 * 3 * 2
-    assert "| quadrotor |" in sheet.markdown()
-
-
-def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
-    specs = make_grid(("pendulum",), ("random",), range(3), **SHORT, **TASK)
-    with filled(tmp_path, specs) as reader:
-        part = control_part(select(reader, Filter()))
-        (entry,) = part.entries
-        costs = relative_costs(reader, entry)
-        assert costs.values.shape == (3, 3)
-        assert scores_at(reader, entry, 19).by_seed == {}
-        assert sorted(scores_at(reader, entry, 20).by_seed) == [0, 1, 2]
-        assert control_of(reader, part, "pendulum").loc["random", "n"].tolist() == [3, 3, 3]
-
-
-def overflown(measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int) -> Edit:
-    """Return an edit that makes a number infinite, as the episode of a crashed plant has it."""
-    return valued(
-        lambda spec, row: (
-            np.inf
-            if (row.t, row.measure) == (t, measure)
-            and spec.policy.name in policies
-            and spec.seed in seeds
-            else None
-        )
-    )
-
-
-def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
-    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **TASK)
-    with filled(tmp_path, specs, edit=overflown("control_cost", ("random",), (1, 3), 20)) as reader:
-        part = control_part(select(reader, Filter()))
-        curves = control_of(reader, part, "pendulum")
-        entry = next(entry for entry in part.entries if entry.config.policy == "random")
-        scores = scores_at(reader, entry, 20).by_seed
-        table = compare_control(reader, part)
-    curve = curves.loc["random"]
-    assert curve["n"].tolist() == [5, 5, 5]
-    assert curve["lost"].tolist() == [0, 2, 0]
-    assert {seed for seed, score in scores.items() if np.isinf(score)} == {1, 3}
-    finite = [score for score in scores.values() if np.isfinite(score)]
-    assert curve["cost"].iloc[1] == pytest.approx(np.exp(np.mean(np.log(finite))))
-    assert curves.loc["d_optimal", "lost"].tolist() == [0, 0, 0]
-    row = table[table.t == 20].iloc[0]
-    assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 0.0)
-    assert row.p_value == pytest.approx(2 / 2**5)  # all five, the lost ones too
-    lines = control_table(table).markdown().splitlines()
-    assert "], 2 lost |" in lines[2]
-    assert "lost" not in lines[3]
-
-
 def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> None:
-    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **TASK)
-    with filled(
-        tmp_path,
-        specs,
-        edit=overflown("true_model_cost", ("d_optimal", "random"), tuple(range(5)), 0),
-    ) as reader:
-        part = control_part(select(reader, Filter()))
-        curves = control_of(reader, part, "pendulum").loc[["d_optimal", "random"]]
-        table = compare_control(reader, part)
+    policies, seeds = ("d_optimal", "random"), tuple(range(5))
+    specs = make_grid(("pendulum",), policies, seeds, **SHORT, **TASK)
+    edit = valued(lambda _, row: np.inf if row.measure == "true_model_cost" else None)
+    with filled(tmp_path, specs, edit=edit) as reader:
+        (group,) = variant_groups(reader, Filter())
+        curves = control_of(reader, group).loc[["d_optimal", "random"]]
     assert (curves["lost"] == 5).all()
     assert curves["cost"].isna().all()
     assert curves.loc["d_optimal", "success"].iloc[-1] == 1.0
-    assert "| –, 5 lost |" in " ".join(control_table(table).markdown().split())
-
-
-def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
-    specs = make_grid(("pendulum",), ("d_optimal",), range(3), **SHORT, **TASK)
-    specs += make_grid(("pendulum",), ("random",), range(5), **SHORT, **TASK)
-    lost = {(seed, "true_model_success"): 0.0 for seed in (0, 4)} | {(4, "true_model_cost"): np.inf}
-    edit = valued(lambda spec, row: lost.get((spec.seed, row.measure)))
-    with filled(tmp_path, specs, edit=edit) as reader:
-        part = control_part(select(reader, Filter()))
-        truth = true_model(reader, part.of("pendulum"))
-        shown = control_of(reader, part, "pendulum")
-    assert (truth["n"], truth["lost"]) == (5, 1)  # each seed once
-    assert truth["success"] == pytest.approx(3 / 5)
-    assert truth["success_low"] < 3 / 5 < truth["success_high"]
-    shown = shown[shown["variant"] == TRUTH]
-    assert shown["t"].tolist() == [0, 20, 60]
-    assert (shown[[*truth]] == [*truth.values()]).all(axis=None)
-
-
-def test_a_grid_without_a_task_has_no_such_table(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
-    fill(url, make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT))
-    names = ("comparison_control",)
-    with Reader.open(url) as reader:
-        outcomes = build(
-            reader, select(reader, Filter()), PlotOptions(), tmp_path / "figures", names
-        )
-        states = {outcome.name: outcome.state for outcome in outcomes}
-    assert all(states[name] == "not drawn, nothing is stored for it" for name in names)
-
-
-def test_assessments_as_a_frame(url: str) -> None:
-    with analysis.load(url, env="pendulum") as results:
-        frame = results.assessments("control_cost", "coverage")
-        assert set(frame.measure) == {"control_cost", "coverage"}
-        assert len(frame) == 3 * 5 * 4 * 2
-        assert frame[frame.measure == "coverage"].groupby("t").value.first().tolist() == [
-            0.0,
-            pytest.approx(1 / 3),
-            pytest.approx(2 / 3),
-            1.0,
-        ]
-        assert set(results.assessments().measure) > set(frame.measure)
-    with analysis.load(url, env="cartpole") as results:
-        assert results.assessments().empty
 
 
 @given(
@@ -479,11 +345,10 @@ def test_white_noise_is_flat_at_its_variance_over_the_nyquist_frequency() -> Non
     noise = np.sqrt(variance) * np.random.default_rng(0).normal(size=(400, 200, 1))
     spectrum = average_spectrum(noise, dt)
     level = variance / (0.5 / dt)
-    assert spectrum.mean[1:-1] == pytest.approx(level, rel=0.25)
+    assert spectrum["mean"][1:-1] == pytest.approx(level, rel=0.25)
     # a periodogram ordinate is exponential: its quantiles are -log(0.9) and -log(0.1) of the mean
-    assert spectrum.low[1:-1].mean() == pytest.approx(-np.log(0.9) * level, rel=0.1)
-    assert spectrum.high[1:-1].mean() == pytest.approx(-np.log(0.1) * level, rel=0.1)
-    assert spectrum.n == 400
+    assert spectrum["quantile_10"][1:-1].mean() == pytest.approx(-np.log(0.9) * level, rel=0.1)
+    assert spectrum["quantile_90"][1:-1].mean() == pytest.approx(-np.log(0.1) * level, rel=0.1)
 
 
 ANGLES = st.lists(st.floats(-30, 30), min_size=1, max_size=30)

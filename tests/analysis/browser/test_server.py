@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import os
 import re
 import select
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -25,13 +22,11 @@ from urllib.parse import urlencode, urlsplit
 import httpx
 import pytest
 from playwright.sync_api import Browser, expect
-from starlette.routing import Route
 
 from analysis.cli import main
 from analysis.serve import app, web
 from analysis.serve import app as serving
-from analysis.serve.app import create_app
-from analysis.serve.web import Cache, Database, Events, loss_text, plain, read_progress
+from analysis.serve.web import Cache, Database, Events, plain, read_progress
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
@@ -56,7 +51,6 @@ def taken() -> Iterator[int]:
         (["--host", "no.such.host.invalid"], "cannot listen at no.such.host.invalid"),
         (["--db", "nothing"], "The database URL cannot be read"),
         (["--where", "model.width=3"], "--where"),
-        (["--db", "sqlite:///a.db", "sqlite:///b.db"], "orchestrate merge"),
         (["--figures", "figures"], "open README.md"),
     ],
 )
@@ -99,13 +93,6 @@ def test_a_kept_value_is_not_computed_again_until_it_is_forgotten() -> None:
 def test_numbers_that_are_not_finite_are_null() -> None:
     found = plain({"a": [float("nan"), float("inf"), 1.5], "b": (True, None, Path("x"))})
     assert found == {"a": [None, None, 1.5], "b": [True, None, "x"]}
-
-
-def test_small_losses_are_written_with_a_power_of_ten() -> None:
-    assert loss_text(0.804, 0.112) == "0.80 ± 0.11"
-    assert loss_text(3.449e-4, 3.86e-5) == "(3.45 ± 0.39) · 10⁻⁴"
-    assert loss_text(float("nan"), None) == "–"
-    assert loss_text(1.5, float("nan")) == "1.50"
 
 
 ENDLESS = "SELECT instr(hex(zeroblob(30000000)), hex(zeroblob(15000000)) || '1')"
@@ -257,32 +244,6 @@ def test_strangers_cannot_fill_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [passed(4), passed(4)] == [True, True]
 
 
-def test_a_page_that_never_ends_does_not_keep_the_server(
-    sqlite_grid: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(serving, "END_SECONDS", 0.5)
-    left, asked = threading.Event(), threading.Event()
-
-    def stuck(_: object) -> None:
-        asked.set()
-        assert left.wait(PATIENCE_SECONDS)
-
-    pages = create_app(sqlite_grid)
-    pages.routes.insert(0, Route("/stuck", stuck))
-    server = serving.Server(pages, 0, leave=left.set)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    until(lambda: server.started)
-    port = server.servers[0].sockets[0].getsockname()[1]
-    address = f"http://127.0.0.1:{port}"
-    with connected(address, request(address, "/stuck")):
-        assert asked.wait(PATIENCE_SECONDS)
-        server.should_exit = True
-        assert left.wait(PATIENCE_SECONDS)
-        thread.join(PATIENCE_SECONDS)
-    assert not thread.is_alive()
-
-
 T = TypeVar("T")
 
 
@@ -290,56 +251,6 @@ def run(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run in a thread: in this one the browser of other tests may have a loop that runs."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(asyncio.run, coroutine).result()
-
-
-@contextmanager
-def heard(address: str) -> Iterator[Iterator[tuple[str, Any]]]:
-    """Yield the events of a server, each with its content."""
-    with httpx.stream("GET", f"{address}/api/events", timeout=PATIENCE_SECONDS) as answer:
-        assert answer.status_code == 200
-        assert answer.headers["content-type"].startswith("text/event-stream")
-        lines = (line for line in answer.iter_lines() if line and not line.startswith(":"))
-        yield (
-            (name.removeprefix("event: "), json.loads(data.removeprefix("data: ")))
-            for name, data in zip(lines, lines, strict=False)
-        )
-
-
-def test_a_change_is_an_event(url: str) -> None:
-    specs = make_grid(("pendulum",), ("random",), range(2), **grids.SHORT)
-    with (
-        Store.open(url) as store,
-        chromium.served(url) as address,
-        heard(address) as stream,
-    ):
-        assert next(stream)[1]["total"] == 0
-        launch = grids.begin(store)
-        store.register(launch, specs)
-        while (said := next(stream))[1]["total"] == 0:
-            pass
-        assert said[0] == "progress"
-        grids.finish(store, launch, specs[0])
-        assert next(stream)[1]["ended"] == 1
-
-
-def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/results.db"
-    with chromium.served(url) as address, heard(address) as stream:
-        name, content = next(stream)
-        assert name == "unavailable"
-        assert "There is no results database" in content["error"]
-        grids.one_trial(f"sqlite:///{tmp_path}/new.db")
-        shutil.move(tmp_path / "new.db", tmp_path / "results.db")
-        name, content = next(stream)
-        assert (name, content["total"]) == ("progress", 1)
-
-
-def test_an_open_stream_does_not_keep_the_server(sqlite_grid: str) -> None:
-    with ExitStack() as stack:
-        with chromium.served(sqlite_grid) as address:
-            stream = stack.enter_context(heard(address))
-            assert next(stream)[0] == "progress"
-        assert list(stream) == []
 
 
 def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,7 +131,7 @@ def test_the_pages_show_it_live(url: str, run: Explorer) -> None:
     run.save(url)
     key = content(url)["trial_key"]
     with TestClient(create_app(url), base_url="http://127.0.0.1:8000") as client:
-        for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
+        for page in ("/", "/trials", f"/trials/{key}", "/curves"):
             assert client.get(page).status_code == 200, page
         assert "prequential loss" in client.get("/").text
         assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text

@@ -120,7 +120,7 @@ def test_pages_commands_and_merges_know_it(
 ) -> None:
     key = found.store(url)
     with TestClient(create_app(url), base_url="http://127.0.0.1:8000") as client:
-        for page in ("/", "/trials", "/curves", "/sql"):
+        for page in ("/", "/trials", "/curves"):
             assert client.get(page).status_code == 200, page
         assert f'href="/trials/{key}"' in client.get("/").text
         page = client.get(f"/trials/{key}").text

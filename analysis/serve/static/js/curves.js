@@ -2,8 +2,8 @@
 
 import { draw, element, logRange, nameLines, numeral, part, swatch } from "./chart.js";
 
-const DEFAULTS = { column: "loss", x: "steps", style: "band", range: "main", diverged: "exclude" };
-const ASKED = ["env", "width", "column", "x", "diverged", "where"];
+const DEFAULTS = { column: "loss", x: "steps", style: "band", range: "main" };
+const ASKED = ["env", "width", "column", "x", "where"];
 const PREQUENTIAL = "Prequential loss against time: the error of each predicted acceleration before it is learned, not an error over a grid.";
 
 const form = /** @type {HTMLFormElement|null} */ (part("controls"));
