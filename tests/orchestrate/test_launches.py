@@ -11,56 +11,56 @@ from pathlib import Path
 
 import pytest
 
-from dopt.errors import SpecificationError
 from dopt.run import run_trial
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate import launch
 from orchestrate.__main__ import main
-from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
 from orchestrate.errors import ExitCode
-from orchestrate.runner.start import Work, launch_grid
+from orchestrate.runner.start import Work
 from orchestrate.store import Reader
 from orchestrate.store.maintenance import examine
-from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.faults.laboratory import flaws
-from tests.orchestrate.standins import specification
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until
 
 
 def words(executor: str, url: str) -> list[str]:
-    """Return the words that launch two short trials of two systems, one of which changes."""
+    """Return the words that launch short trials of two systems, one of which changes."""
     grid = ["-m", "env=pendulum,beyond/drifting_pendulum", "policy=d_optimal", "seed=range(2)"]
-    return [*grid, "env.horizon=12", f"executor={executor}", f"store.url={url}"]
+    task = [
+        "task=none,control",
+        "task.checkpoints=[3]",
+        "task.free_run_steps=4",
+        "task.settle_steps=2",
+    ]
+    small = [f"task.{name}" for name in ("steps=12", "samples=8", "elites=2", "lookahead=3")]
+    return [*grid, "env.horizon=12", *task, *small, f"executor={executor}", f"store.url={url}"]
 
 
-def losses(url: str) -> list[float]:
+def numbers(url: str) -> list[tuple[object, ...]]:
+    """Return the losses of all steps, and what was assessed."""
     with Reader.open(url) as reader:
-        configs = sorted(reader.configs(), key=lambda config: config.config_key)
-        return [
-            float(loss)
-            for config in configs
-            for loss in reader.curves(config.config_key).values.ravel().tolist()
-        ]
+        losses = "SELECT config_key, seed, t, loss FROM v_curve ORDER BY 1, 2, 3"
+        measured = "config_key, seed, t, measure, value"
+        measures = f"SELECT {measured} FROM v_assessment ORDER BY {measured}"
+        return [tuple(row) for sql in (losses, measures) for row in reader.rows(sql)]
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> list[float]:
-    """Return the losses of the trials one after the other in this process."""
+def alone(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a database of the trials one after the other in this process."""
     url = f"sqlite:///{tmp_path_factory.mktemp('alone') / 'results.db'}"
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("DOPT_DB", raising=False)
         patch.setattr(sys, "argv", ["launch.py", *words("inprocess", url)])
         assert launch.main() == 0
-    return losses(url)
+    return url
 
 
 @pytest.mark.parametrize("executor", ["local", "ray"])
 @pytest.mark.xdist_group("real trials")  # one run in one process for all of them
-def test_every_executor_stores_the_same_losses(
-    executor: str, alone: list[float], tmp_path: Path
-) -> None:
+def test_every_executor_stores_the_same_numbers(executor: str, alone: str, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / executor}.db"
     done = subprocess.run(
         [sys.executable, "orchestrate/launch.py", *words(executor, url)],
@@ -70,63 +70,17 @@ def test_every_executor_stores_the_same_losses(
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert len(alone) == 48
-    assert losses(url) == alone
+    assert len(numbers(alone)) == 6 * 12 + 2 * (2 + 4 * 3)
+    assert numbers(url) == numbers(alone)
 
 
-SHORT = {
-    "name": "control",
-    "checkpoints": [3],
-    "steps": 12,
-    "settle_steps": 2,
-    "samples": 8,
-    "elites": 2,
-    "lookahead": 3,
-    "free_run_steps": 4,
-}
-
-
-def grid(task: object, seeds: int) -> Grid:
-    settings = {**specification(0).to_mapping(), "task": task}
-    return build_grid([Combination(settings, seeds=range(seeds))])
-
-
-def launched(folder: Path, executor: str, trials: Grid) -> str:
-    """Run a grid of real trials into a database of its own; return its URL."""
-    url = f"sqlite:///{folder / executor}.db"
-    settings = LaunchSettings(executor=executor, store_url=url, workers=2)
-    work = Work(run_trial)
-    code = launch_grid(trials, settings, RECORD, work, lambda _: None, stream=None)
-    assert code is ExitCode.DONE
-    return url
-
-
-def rows(url: str) -> list[tuple[object, ...]]:
-    with Reader.open(url) as reader:
-        sql = "SELECT seed, t, measure, value FROM v_assessment ORDER BY seed, t, measure"
-        return [tuple(row) for row in reader.rows(sql)]
-
-
-def test_the_rows_do_not_depend_on_the_executor(tmp_path: Path) -> None:
-    trials = grid(SHORT, seeds=3)
-    alone = launched(tmp_path, "inprocess", trials)
-    assert len(rows(alone)) == 3 * (2 + 4 * 3)
-    assert rows(launched(tmp_path, "local", trials)) == rows(alone)
+@pytest.mark.xdist_group("real trials")
+def test_what_is_stored_names_its_trials(alone: str) -> None:
     assert [one for one in examine(alone) if one.severity == "error"] == []
     with Reader.open(alone) as reader:
-        (config,) = reader.configs()
-    again = TrialSpec.from_mapping(without_versions(config.config))
-    assert [trial.trial_key for trial in trials.trials][:1] == [again.trial_key]
-
-
-def test_a_task_of_none_is_no_task() -> None:
-    keys = [trial.trial_key for trial in grid({"name": "none"}, seeds=2).trials]
-    assert keys == [specification(seed).trial_key for seed in range(2)]
-
-
-def test_a_checkpoint_beyond_the_end_stops_before_anything_runs() -> None:
-    with pytest.raises(SpecificationError, match="step 9, but a trial has 5 steps"):
-        grid({**SHORT, "checkpoints": [9]}, seeds=1)
+        for config in reader.configs():
+            again = TrialSpec.from_mapping(without_versions(config.config))
+            assert again.trial_key in {row.trial_key for row in reader.trials(config.config_key)}
 
 
 GRID = ("policy=random", "env.horizon=5", "executor=inprocess")
@@ -180,8 +134,7 @@ def test_merged_shares_are_the_rows_of_one_database(
     monkeypatch.setattr("orchestrate.runner.start.WORK", Work(run_trial))
     assert command_line("-m", *GRID, "seed=range(20)", f"store.url={one}")[0] == 0
     assert main(["merge", f"{tmp_path}/shared", "--db", merged]) == 0
-    assert trials(merged) == trials(one)
-    assert losses(merged) == losses(one)
+    assert numbers(merged) == numbers(one)
     assert flaws(merged) == []
 
 
