@@ -527,7 +527,8 @@ def _driven_joints(model: mujoco.MjModel) -> list[int]:
     import mujoco
 
     by_joint = {j for _, j, _, _ in actuators(model)}
-    coupled = model.eq_obj1id[(model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0]
+    active = model.eq_active0.astype(bool)
+    coupled = model.eq_obj1id[active & (model.eq_type == mujoco.mjtEq.mjEQ_JOINT)]
     free = [j for j in range(model.njnt) if model.jnt_type[j] in (HINGE, SLIDE)]
     return sorted(by_joint) or [j for j in free if j not in coupled]
 

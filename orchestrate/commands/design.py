@@ -13,7 +13,7 @@ import numpy as np
 
 from orchestrate.commands import Command, answer
 from orchestrate.errors import ExitCode
-from orchestrate.files import make_folder, whole
+from orchestrate.files import whole, writing
 from orchestrate.program import UsageError, integer, path, positive, tell
 
 if TYPE_CHECKING:
@@ -194,8 +194,10 @@ def _expected(document: dict[str, Any], how: str) -> list[str]:
 def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]) -> ExitCode:
     from dopt.robots.design import Design
 
-    for target in filter(None, (arguments.out, arguments.ros)):  # before minutes of search
-        make_folder(target.parent)
+    for option, target in (("--out", arguments.out), ("--ros", arguments.ros)):
+        if target:  # before minutes of search
+            with writing(target, option):
+                target.parent.mkdir(parents=True, exist_ok=True)
     design = Design.of(
         problem,
         seed=arguments.seed,
