@@ -101,18 +101,13 @@ def test_only_the_trial_key_depends_on_the_seed(first: int, second: int) -> None
 
 def test_the_key_does_not_depend_on_how_a_value_is_written() -> None:
     spec = trial("pendulum", "d_optimal", env={"mass": 1, "initial_state": [0, 0]})
+    env = {"initial_state": (0.0, -0.0), "grid_points": (4, 4), "mass": 1.0, "horizon": 30}
     same: dict[str, Any] = {
         "seed": 0,
         "learner": {"name": "adam_window"},
         "model": {"depth": 2, "width": 16, "name": "mlp"},
         "policy": {"regularization": 0.001, "name": "d_optimal"},
-        "env": {
-            "initial_state": (0.0, -0.0),
-            "grid_points": (4, 4),
-            "mass": 1.0,
-            "horizon": 30,
-            "name": "pendulum",
-        },
+        "env": env | {"name": "pendulum"},
     }
     assert TrialSpec.from_mapping(same).trial_key == spec.trial_key
 
