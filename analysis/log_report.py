@@ -517,14 +517,15 @@ def run_fit(options: argparse.Namespace) -> int:
         progress=lambda text: tell(sys.stderr, f"{text}\n"),
     )
     tell(sys.stdout, f"{found.report()}\n")
-    from analysis.figures.reports import draw_fit  # Matplotlib: other commands do without it
-
     options.out.mkdir(parents=True, exist_ok=True)
-    draw_fit(found, (tests or logs)[0], options.out / "fit.png")
     found.save(options.out / "model.npz")
-    tell(sys.stdout, f"picture: {options.out / 'fit.png'}\nmodel: {options.out / 'model.npz'}\n")
+    tell(sys.stdout, f"model: {options.out / 'model.npz'}\n")
     if options.db:
         tell(sys.stdout, f"trial: {found.store(options.db)}\n")
+    from analysis.figures.reports import draw_fit  # Matplotlib: other commands do without it
+
+    draw_fit(found, (tests or logs)[0], options.out / "fit.png")
+    tell(sys.stdout, f"picture: {options.out / 'fit.png'}\n")
     return 0
 
 

@@ -36,7 +36,7 @@ def save(found: Any, path: str | Path) -> None:
     values, s, plant = model.values(p), model.structure, found.plant
     W1, b1, W2, b2 = model.matrices(values.weights)
     np.savez(
-        Path(path).with_suffix(".npz"),
+        path,  # to which ".npz" is added where it is missing
         states=np.array([*plant.states]),
         inputs=np.array([*plant.inputs]),
         known=np.array([plant.known.get(name, "0.0") for name in plant.states]),

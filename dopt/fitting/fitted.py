@@ -265,7 +265,8 @@ class Fitted:
         data = data_of(self.plant, self.tests, self.hold, self._deviations)
         history, skip, ahead = 0.5 * self.selection.window, self._latest(), 2.0 * self.plant.dt
         longest = float((data.time[data.lasts] - data.time[data.firsts]).max())
-        horizon = min(max(self.horizons), longest - history - skip - ahead - 2.0 * self.plant.dt)
+        left = longest - history - skip - ahead - 2.0 * self.plant.dt
+        horizon = max(0.0, min(max(self.horizons), left))
         rows = prediction_rows(
             data, (0, len(data.time) - 1), history, horizon, skip=skip, ahead=ahead
         )
@@ -306,25 +307,22 @@ class Fitted:
         last ten inputs; 0 of a model that leaves nothing but white noise.
         """
         model, solution, _, _ = self.chosen
-        simulator, data = Simulator(model, self.data), self.data
-        out = {}
-        for c, name in enumerate(measured_names(self.plant)):
-            now, before, rows = [], [], []
-            for (first, last), start in zip(*solution.windows, strict=True):
-                at = np.arange(first, last + 1)
-                states = simulator.states(solution.p, first, last, start)
-                error = data.measured[at, c] - states[:, model.structure.measured[c]]
-                at, error = at[np.isfinite(error)], error[np.isfinite(error)]
-                now.append(error[1:])
-                before.append(error[:-1])
-                rows.append(at[1:])
-            r, at = np.concatenate(now), np.concatenate(rows)
+        residuals = Simulator(model, self.data).residuals(solution.p, solution.windows)
+        each = [np.arange(first, last + 1) for first, last in solution.windows.rows]
+        rows, owners = np.concatenate(each), np.repeat(np.arange(len(each)), [*map(len, each)])
+        firsts, u, out = self.data.firsts, self.data.inputs, {}
+        for name, column in zip(measured_names(self.plant), residuals.T, strict=True):
+            seen = np.flatnonzero(np.isfinite(column))
+            now, before = seen[1:], seen[:-1]
+            same = owners[now] == owners[before]
+            now, before = now[same], before[same]
+            at, r = rows[now], column[now]
             inputs = [
-                _correlation(r, data.inputs[np.maximum(at - lag, data.firsts[at]), j])
+                _correlation(r, u[np.maximum(at - lag, firsts[at]), j])
                 for lag in range(10)
-                for j in range(data.inputs.shape[1])
+                for j in range(u.shape[1])
             ]
-            out[name] = _correlation(r, np.concatenate(before)), max(inputs, key=abs)
+            out[name] = _correlation(r, column[before]), max(inputs, key=abs)
         return out
 
     def verdict(self) -> str:

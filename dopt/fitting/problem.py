@@ -590,24 +590,6 @@ def errors_ahead(
     return out
 
 
-class _Rows(NamedTuple):
-    """Measured rows of data, in units of their spread."""
-
-    at: Integers  # (N,) their rows in the data
-    outputs: Array  # (N, n)
-    inputs: Array  # (N, m)
-    late: int  # rows from an input to its effect
-
-    def regressors(self, k: Integers) -> Array:
-        """Return earlier outputs, the newest first, earlier inputs, and 1."""
-        past = [self.outputs[k - 1 - i] for i in range(ORDER)]
-        return np.concatenate([*past, *self.before(k), np.ones((len(k), 1))], axis=1)
-
-    def before(self, k: Any) -> list[Array]:
-        """Return the inputs that count at rows k, the newest first."""
-        return [self.inputs[k - 1 - self.late - i] for i in range(ORDER)]
-
-
 def linear_predictions(
     train: Data,
     data: Data,
@@ -624,31 +606,37 @@ def linear_predictions(
     level, scale = np.nanmean(train.measured, axis=0), np.nanstd(train.measured, axis=0)
     scale, size = np.maximum(scale, 1e-300), np.maximum(np.abs(train.inputs).max(axis=0), 1e-300)
     late = max(0, round(delay / step))
+    depth, out = ORDER + late, Predicted([], [], [], data.deviations)
 
-    def of(each: Data) -> _Rows:
+    def of(each: Data) -> tuple[Integers, Array, Array]:
         seen = np.flatnonzero(np.isfinite(each.measured).all(axis=1))
-        return _Rows(seen, (each.measured[seen] - level) / scale, each.inputs[seen] / size, late)
+        return seen, (each.measured[seen] - level) / scale, each.inputs[seen] / size
 
-    known, found, depth = of(train), of(data), ORDER + late
-    k = np.arange(depth, len(known.at))
-    k = k[train.firsts[known.at[k]] == train.firsts[known.at[k - depth]]]
+    def past(inputs: Array, k: Any) -> list[Array]:
+        return [inputs[k - 1 - late - i] for i in range(ORDER)]  # the newest first
+
+    at, outputs, inputs = of(train)
+    k = np.arange(depth, len(at))
+    k = k[train.firsts[at[k]] == train.firsts[at[k - depth]]]
     if without is not None:
-        k = k[(known.at[k] < without[0]) | (known.at[k - depth] > without[1])]
-    out = Predicted([], [], [], data.deviations)
+        k = k[(at[k] < without[0]) | (at[k - depth] > without[1])]
     if not len(k):
         return out
-    theta = np.linalg.lstsq(known.regressors(k), known.outputs[k], rcond=None)[0]
+    newest = [outputs[k - 1 - i] for i in range(ORDER)]
+    regressors = np.concatenate([*newest, *past(inputs, k), np.ones((len(k), 1))], axis=1)
+    theta = np.linalg.lstsq(regressors, outputs[k], rcond=None)[0]
+    at, outputs, inputs = of(data)
     for begin, middle, last in rows:
-        ahead = np.flatnonzero((found.at > middle) & (found.at <= last))
-        before = np.flatnonzero((found.at >= begin) & (found.at <= middle))
+        ahead = np.flatnonzero((at > middle) & (at <= last))
+        before = np.flatnonzero((at >= begin) & (at <= middle))
         if len(before) < depth + 1 or not len(ahead):
             continue
-        path = list(found.outputs[before[-ORDER:]][::-1])  # the newest first
+        path = list(outputs[before[-ORDER:]][::-1])  # the newest first
         for row in ahead:
-            regressors = np.concatenate([*path[:ORDER], *found.before(row), [1.0]])
-            path.insert(0, np.clip(regressors @ theta, -1e9, 1e9))
+            one = np.concatenate([*path[:ORDER], *past(inputs, row), [1.0]])
+            path.insert(0, np.clip(one @ theta, -1e9, 1e9))
         simulated = np.array(path[: len(ahead)])[::-1]
-        out.seconds.append(data.time[found.at[ahead]] - data.time[middle])
-        out.errors.append((found.outputs[ahead] - simulated) * scale)
-        out.changes.append((found.outputs[ahead] - found.outputs[before[-1]]) * scale)
+        out.seconds.append(data.time[at[ahead]] - data.time[middle])
+        out.errors.append((outputs[ahead] - simulated) * scale)
+        out.changes.append((outputs[ahead] - outputs[before[-1]]) * scale)
     return out

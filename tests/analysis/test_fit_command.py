@@ -60,6 +60,20 @@ def test_the_plant_of_the_page_is_fitted(
     assert f"trial: {stored.trial_key}" in said
 
 
+def test_a_model_is_kept_whose_picture_cannot_be_drawn(
+    plant: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = tmp_path / "short.csv"
+    short.write_text("".join(run.read_text().splitlines(keepends=True)[:8]))
+    words = ["fit", str(plant), str(run), "--validate", str(short), "--width", "0"]
+    words += ["--columns", "angle=th,voltage=u", "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2
+    said = capsys.readouterr()
+    assert "Not judged: no run is long enough" in said.out
+    assert "no piece of the log is longer" in said.err
+    assert (tmp_path / "out/model.npz").exists()
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
