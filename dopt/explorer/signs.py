@@ -73,8 +73,8 @@ _TEXTS = {
     "take another one such as 'adam_window'",
     "late": "the errors of the predictions follow from inputs of earlier steps, most from the one "
     "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
-    "once, or as declared: declare Plant(delay=..., lag=...), or let learner='simulation_error' fit "
-    "them (dopt.unknown)",
+    "once, or as declared: declare Plant(delay=..., lag=...), or let learner='simulation_error' "
+    "fit them (dopt.unknown)",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
     "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
     "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
