@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import mujoco
 
 BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia="1e-6"/></mujoco>'
-"""What an URDF needs whose inertias are those of no body."""
+"""Settings with which an URDF is read whose inertias no rigid body can have."""
 
 INERTIAL = 10
 """Inertial parameters of a body: m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about its origin."""

@@ -25,7 +25,7 @@ FAST, STRONG = 2.0 * math.pi, 300.0
 """Velocity [rad/s] and torque [N m] from which equal limits of all joints look like defaults."""
 
 WIDE = 1e3
-"""Torques of this size in a robot's file are none."""
+"""Torques of this size in a robot's file count as no limit."""
 
 TINY = 1e-3
 """Friction, as a share of the limit of torque, below which it looks like a default."""
@@ -151,8 +151,8 @@ def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> Specificatio
             lines.append(f"  {name}: {{{', '.join(blanks)}}}")
     return SpecificationError(
         f"limits are missing, but every joint needs its own (rad or m, per second, N m or N; "
-        f"{WIDE:g} or more in the robot's file is none): {said}. Fill in these lines, and give "
-        f"them as a file of limits (--limits FILE):\n" + "\n".join(lines)
+        f"{WIDE:g} or more in the robot's file counts as none): {said}. Fill in these lines, and "
+        f"give them as a file of limits (--limits FILE):\n" + "\n".join(lines)
     )
 
 
