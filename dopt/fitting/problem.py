@@ -285,6 +285,7 @@ def solve(
         weights = 1.0 / (1.0 + squares / scale)
         linear = simulator.linear(p, windows, weights / s**2)
         H, b = linear.normal + np.diag(precision), linear.slope - precision * (p - model.prior)
+        possible = b @ np.linalg.solve(H, b)  # fall that is foreseen without damping
         growth, new = 2.0, math.inf
         size = max(np.trace(H) / max(model.q, 1), 1.0)
         while damping < LARGEST_DAMPING * size:
@@ -298,17 +299,17 @@ def solve(
                 damped = windows._replace(starts=_moved(windows.starts, linear, step, share))
                 worse = np.flatnonzero(after > squares)
                 others = simulator.squares(trial, damped.where(worse))
-                held = worse[others < after[worse]]
+                better = others < after[worse]
+                held = worse[better]
                 moved.starts[held] = damped.starts[held]
-                after[held] = others[others < after[worse]]
+                after[held] = others[better]
             new = cost(after, trial)
             if new < value:
                 break
             damping *= growth
             growth *= 2.0
         if not new < value:
-            foreseen = b @ np.linalg.solve(H, b) + np.sum(linear.g**2)
-            converged = bool(foreseen < tolerance * value)
+            converged = bool(possible + np.sum(linear.g**2) < tolerance * value)
             break
         fall, foreseen = value - new, float(step @ (b + damping * step))
         ratio = fall / foreseen if foreseen > 0.0 else 1.0
@@ -316,8 +317,7 @@ def solve(
         p, windows, squares = trial, moved, after
         if say:
             say(f"  step {steps}: cost {new:.6g}, fall {fall / value:.1e}, damping {damping:.0e}")
-        left = b @ np.linalg.solve(H, b)
-        small = fall < tolerance * value and left < 10.0 * tolerance * value
+        small = fall < tolerance * value and possible < 10.0 * tolerance * value
         calm = calm + 1 if small and not len(held) else 0
         value, converged = new, calm >= 2
     return Solution(p, windows, squares, scale, steps, converged)

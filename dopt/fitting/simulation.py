@@ -602,8 +602,8 @@ def simulate(
     """Simulate windows, (k, 2) first and last rows, from their initial states, (k, d).
 
     ``squares`` are ‖e‖² of the windows, inf where one leaves the limit. ``states`` and ``slopes``
-    belong to the last window, and have room for the longest. Where R has rows, those of the windows
-    are written one below the other, 0 where one leaves the limit; Q, (rows n, d), is room.
+    belong to the last window, and have room for the longest. Where R has rows, the windows write
+    theirs one below the other, 0 where one leaves the limit; Q, (rows n, d), is room.
 
     All that simulates is compiled in this one function.
     """

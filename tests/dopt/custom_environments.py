@@ -127,7 +127,7 @@ PIECE = 7
 
 
 class Whole(PointEnv):
-    """Takes whole numbers, or those of another type."""
+    """Takes whole numbers, of a type that is given."""
 
     def __init__(self, dtype: Any = np.int64) -> None:
         super().__init__(wall=1e9)

@@ -1,4 +1,4 @@
-"""What each test of the soak saw, said at the end."""
+"""Table of what each test of the soak saw, printed at the end."""
 
 from __future__ import annotations
 
