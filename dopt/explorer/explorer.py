@@ -55,6 +55,9 @@ def uninterrupted() -> Iterator[None]:
 MANY = 20
 """States in a row from which nothing was learned that are said."""
 
+TIMED = 100
+"""Steps whose times are compared with dt."""
+
 _log = logging.getLogger("dopt.explorer")
 
 
@@ -229,7 +232,7 @@ class Explorer(Explored):
             self._fits = FitBeside(self._state.fit_request())
         elif (evidence := self._state.steps.evidence) is not None:
             self._fits = FitBeside(first_evidence(), evidence.first_request())
-        self._waits = deadline is None
+        self._waits, self._is_slow = deadline is None, False
         if self._journal is not None:
             self._resume(self._journal)
 
@@ -327,6 +330,8 @@ class Explorer(Explored):
             learned = self._take_in(x, u, now)
             if learned and self._fits is not None:
                 self._refit(self._fits)
+            if learned and not self._waits and self.n_steps % TIMED == 0:
+                self._check_times()
             return learned
 
     def _take_in(self, x: Array, applied: Array | None, now: float | None) -> bool:
@@ -384,6 +389,21 @@ class Explorer(Explored):
             fits.begin(renewal.request(), state.run.fitted, renewal.install)
         elif rows >= due:
             fits.begin(state.fit_request(), rows)
+
+    def _check_times(self) -> None:
+        """Warn once where both calls together take longer than a step."""
+        dt, t = 1e3 * self.spec.system.dt, self.n_steps
+        times = 1e-3 * self._times[:, max(t - TIMED, 0) : t - 1].sum(axis=0)
+        times = times[np.isfinite(times)]  # of steps that were not replayed
+        taken = float(np.median(times)) if len(times) else 0.0
+        if taken > dt and not self._is_slow:
+            self._is_slow = True
+            _log.warning(
+                "ask() and tell() take %.3g ms together, the median of %d steps, but a step "
+                "is to take %g ms: choose a faster policy or learner, such as "
+                "learner={'name': 'gauss_newton', 'refit_every': 0}, which fits beside",
+                *(taken, len(times), dt),
+            )
 
     def _elapsed(self, now: float | None) -> float:
         """Return the seconds since the last state."""

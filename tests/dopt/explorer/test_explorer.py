@@ -338,6 +338,20 @@ def _failing() -> None:
     raise RuntimeError("no plan")
 
 
+@pytest.mark.filterwarnings("ignore::dopt.errors.ScaleWarning")
+@pytest.mark.parametrize(("dt", "said"), [(1e-6, 1), (PATIENCE_SECONDS, 0)])
+def test_calls_that_take_longer_than_a_step_are_said_once(
+    dt: float, said: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    plant = dataclasses.replace(MOTOR, dt=dt)
+    with Explorer(plant, policy="random", deadline=PATIENCE_SECONDS) as explorer:
+        for _ in range(200):
+            explorer.ask([0.0, 1.0])
+            explorer.tell([0.0, 1.0])
+    slow = [m for m in caplog.messages if "but a step is to take" in m]
+    assert len(slow) == said
+
+
 def test_ctrl_c_during_a_call_that_fails_is_not_lost() -> None:
     @uninterrupted()
     def fail() -> None:
