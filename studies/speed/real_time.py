@@ -1,13 +1,15 @@
 """Times of explorations at 200 Hz: ``python -m studies.speed.real_time [--seconds 60] [--busy]``.
 
 A simulated disk is asked and told at its ticks, while fits run beside; with ``--busy`` another
-process computes all the time as well.
+process computes all the time as well. With ``--urgent`` the exploration runs before all others, as
+by ``chrt --fifo 1``.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import os
 import subprocess
 import sys
 import time
@@ -87,18 +89,26 @@ def busy(wanted: bool) -> Iterator[None]:
             process.kill()
 
 
+def schedule(policy: int) -> None:
+    """Let this process, and threads that it begins, be scheduled by a policy of Linux."""
+    os.sched_setscheduler(0, policy, os.sched_param(int(policy == os.SCHED_FIFO)))
+
+
 def main() -> None:
     """Print the times of each learner."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--busy", action="store_true", help="beside a process that computes")
+    parser.add_argument("--urgent", action="store_true", help="as by chrt --fifo 1")
     parser.add_argument("--learner", choices=LEARNERS, nargs="*", default=[*LEARNERS])
     given = parser.parse_args()
     heads = [f"{what} {at}" for what in ("ask", "tell") for at in ("p50", "p99", "max")]
     rows = []
     for name in given.learner:
         with busy(given.busy):
+            schedule(os.SCHED_FIFO if given.urgent else os.SCHED_OTHER)
             times, explorer = run(given.seconds, LEARNERS[name])
+            schedule(os.SCHED_OTHER)
         columns = 1e3 * np.quantile(times, [0.5, 0.99, 1.0], axis=0).T
         both = 1e3 * np.quantile(times.sum(axis=1), 0.99)
         counts = explorer.counts["missed"], explorer.counts["refits"]
