@@ -58,25 +58,6 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"  # also where nothing is installed, as beside PYTHONPATH in the image
 
-__all__ = [
-    "LEARNERS",
-    "MODELS",
-    "POLICIES",
-    "SYSTEMS",
-    "Explorer",
-    "Log",
-    "Plant",
-    "TrialResult",
-    "TrialSpec",
-    "__version__",
-    "choose",
-    "encoder",
-    "fit",
-    "fit_offline",
-    "run_trial",
-    "unknown",
-]
-
 _MODULES = {
     "Explorer": "dopt.explorer",
     "LEARNERS": "dopt.learning",
@@ -94,6 +75,8 @@ _MODULES = {
     "run_trial": "dopt.run",
     "unknown": "dopt.systems.plant",
 }
+
+__all__ = [*_MODULES, "__version__"]
 
 
 def _load(name: str) -> object:

@@ -86,8 +86,3 @@ DOMAIN_MARGIN = 0.25
 
 SPREAD_KEPT = 0.1
 """Share of the mean and the spread of one iteration of the cross-entropy method in the next."""
-
-
-def switch_step(steps: int) -> int:
-    """Return the step at which a plan of so many steps may switch its input, ``steps`` if never."""
-    return steps // 2 if steps > 1 else steps

@@ -40,7 +40,7 @@ def whole(what: str, given: object, lower: int = -LARGEST_WHOLE, upper: int = LA
 
 def reals(what: str, given: npt.ArrayLike) -> Array:
     """Return an array of real numbers, or raise SpecificationError."""
-    values = _array(given)
+    values = as_array(given)
     if values.dtype.kind not in "fiu":
         raise SpecificationError(
             f"{what} of the type {values.dtype} were given, but an array of real numbers is "
@@ -51,7 +51,7 @@ def reals(what: str, given: npt.ArrayLike) -> Array:
 
 def numbers(what: str, given: npt.ArrayLike, size: int) -> Array:
     """Return so many real numbers, or raise SpecificationError."""
-    values = _array(given)
+    values = as_array(given)
     if values.shape != (size,) or values.dtype.kind not in "fiu":
         raise SpecificationError(
             f"{what} has the shape {values.shape} and the type {values.dtype}, but {size} real "
@@ -102,15 +102,18 @@ def seconds(given: float | None) -> float | None:
 
 
 def _is_real(given: object, kinds: str = "fiu") -> bool:
-    value = _array(given)
+    value = as_array(given)
     return value.shape == () and value.dtype.kind in kinds
 
 
-def _array(given: Any) -> npt.NDArray[Any]:
+def as_array(given: Any) -> npt.NDArray[Any]:
+    """Return an array of anything; of objects if it is none, such as lists of two lengths."""
     try:
         return np.asarray(given)
     except ValueError:  # rows of different lengths
         return np.asarray(given, dtype=object)
+    except (TypeError, RuntimeError):
+        return np.array(None)
 
 
 # Systems that are stepped somewhere else, as an explorer sees them.

@@ -25,6 +25,7 @@ from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.limits import VIOLATIONS, WORST
 from dopt.models import MLP, Linear, Model
+from dopt.models.linear import linear_terms
 from dopt.offline_fit import sample_loss
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
@@ -193,12 +194,10 @@ def loss_by_parameter_error(system: System) -> float:
     SpecificationError
         If G is no multiple of the identity matrix, or the system changes with time.
     """
-    q = len(true_parameters(system))
-    points, model = evaluation_set(system), Linear()
+    q, points = len(true_parameters(system)), evaluation_set(system)
     at = system.points(points.states, points.inputs)[: points.n_grid]
-    offset = model.predict_at(system, np.zeros(q), at)
-    regressors = np.stack([model.predict_at(system, unit, at) - offset for unit in np.eye(q)])
-    G = np.einsum("inr,jnr->ij", regressors, regressors) / len(at)
+    _, regressors = linear_terms(system, at)
+    G = np.einsum("nri,nrj->ij", regressors, regressors) / len(at)
     square = float(G[0, 0])
     if len(system.history) > 1 or not np.allclose(
         G, square * np.eye(q), rtol=0.0, atol=TOLERANCE * abs(square)

@@ -1,4 +1,4 @@
-"""Plan of a trial whose policy brings one in numpy."""
+"""Plan and update of a trial, written in numpy."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from dopt.arguments import as_array
 from dopt.control.task import Feedback
 from dopt.errors import SpecificationError
 from dopt.learning import Adam
+from dopt.learning.base import CustomLearner, Updater
 from dopt.models import MLP
 from dopt.policies import POLICIES, Disagreement
 from dopt.policies.base import Array, CustomPolicy, Planner, TaskPolicy
@@ -45,6 +47,22 @@ def custom_planner(spec: TrialSpec) -> Planner | None:
     return _Checked(policy.name, plan)
 
 
+def custom_updater(spec: TrialSpec) -> Updater | None:
+    """Return a new update of a trial; None where the learner brings none.
+
+    Raises
+    ------
+    SpecificationError
+        If a user's learner returns something else.
+    """
+    learner = spec.learner
+    if not isinstance(learner, CustomLearner):
+        return None
+    updater = learner.updater(spec.system, stream(spec.seed, "updater"))
+    check_returned(f"learner '{learner.name}'", "updater", updater, Updater)
+    return updater
+
+
 class _Checked(Planner):
     """A user's plan, whose inputs are finite numbers or refused."""
 
@@ -60,11 +78,9 @@ class _Checked(Planner):
             If it is no array of real numbers, or not finite while the model still is sound.
         """
         given: Any = self._plan.choose(view)
-        chosen = _array(given)
-        if (
-            chosen is not None
-            and chosen.dtype.kind in "fiu"
-            and (np.isfinite(chosen).all() or not np.abs(view.parameters).max() < OVERFLOWING)
+        chosen = as_array(given)
+        if chosen.dtype.kind in "fiu" and (
+            np.isfinite(chosen).all() or not np.abs(view.parameters).max() < OVERFLOWING
         ):
             return chosen
         shown = " ".join(repr(given).split())
@@ -79,12 +95,3 @@ class _Checked(Planner):
 
     def feedback(self) -> Feedback | None:
         return self._plan.feedback()
-
-
-def _array(given: Any) -> Array | None:
-    """Return what was given as an array; None if it is not one, such as lists of two lengths."""
-    try:
-        array: Array = np.asarray(given)
-    except (TypeError, ValueError, RuntimeError):
-        return None
-    return array

@@ -179,8 +179,7 @@ def rates(
     system: System, accelerations: Callable[[Array, Array], Array], inputs: Array, states: Array
 ) -> Array:
     """Return dx/dt, (N, d), of states (N, d) under inputs (N, m), with accelerations (N, r)."""
-    known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
-    flow = np.stack(np.broadcast_arrays(*known, states[:, 0])[:-1], axis=-1)
+    flow = system.known_flow(states, inputs)
     flow[:, list(system.learned_rows)] += accelerations(states, inputs)
     return flow
 

@@ -61,26 +61,14 @@ Bound = Literal["any", "positive", "nonnegative", "fraction", "share"]
 
 _LARGEST_REAL = sys.float_info.max
 
-_BOUNDS: dict[str, tuple[Callable[[float], bool], str, str]] = {
-    "any": (lambda _: True, "finite", "a finite number"),
-    "positive": (lambda value: value > 0, "finite and above 0", "a positive number"),
-    "nonnegative": (lambda value: value >= 0, "finite and at least 0", "0 or a positive number"),
-    "fraction": (
-        lambda value: 0 <= value < 1,
-        "at least 0 and below 1",
-        "a number from 0 to below 1",
-    ),
-    "share": (lambda value: 0 < value <= 1, "above 0 and at most 1", "a positive number up to 1"),
+_BOUNDS: dict[str, tuple[Callable[[float], bool], str, str, int]] = {
+    "any": (lambda _: True, "finite", "a finite number", -LARGEST_WHOLE),
+    "positive": (lambda value: value > 0, "finite and above 0", "a positive number", 1),
+    "nonnegative": (lambda value: value >= 0, "finite and at least 0", "0 or a positive number", 0),
+    "fraction": (lambda x: 0 <= x < 1, "at least 0 and below 1", "a number from 0 to below 1", 0),
+    "share": (lambda x: 0 < x <= 1, "above 0 and at most 1", "a positive number up to 1", 1),
 }
-"""Check of each bound, the bound in words, and what to set a field to that is outside it."""
-
-_SMALLEST_WHOLE = {
-    "any": -LARGEST_WHOLE,
-    "positive": 1,
-    "nonnegative": 0,
-    "fraction": 0,
-    "share": 1,
-}
+"""Check of each bound, it in words, what to set a field to outside it, and the least integer."""
 
 
 def parameter(
@@ -254,9 +242,9 @@ def _converted_number(
         raise _wrong_type(path, value, expected)
     number = value if whole else _real(value)
     bound = field.metadata.get("bound", "any")
-    holds, words, remedy = _BOUNDS[bound]
+    holds, words, remedy, least = _BOUNDS[bound]
     if whole:
-        words = f"from {_SMALLEST_WHOLE[bound]} to {LARGEST_WHOLE}"
+        words = f"from {least} to {LARGEST_WHOLE}"
         remedy = "a whole number in this range"
     if not abs(number) <= (LARGEST_WHOLE if whole else _LARGEST_REAL) or not holds(number):
         unit = field.metadata.get("unit", "1")
@@ -282,10 +270,8 @@ def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:
     )
 
 
-PLAN_IN_NUMPY = "dopt.kernel.loop.plan_in_numpy"
-LEARN_IN_NUMPY = "dopt.kernel.loop.learn_in_numpy"
-IN_NUMPY = (PLAN_IN_NUMPY, LEARN_IN_NUMPY)
-"""Kernel functions of parts that the interpreter runs: they do nothing."""
+IN_NUMPY = "dopt.kernel.loop.do_nothing"
+"""Kernel function of parts that the interpreter runs."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -339,7 +325,7 @@ class KernelPart(KernelSupport):
 
     @classmethod
     def is_in_numpy(cls) -> bool:
-        return cls.kernel_function in IN_NUMPY and not cls.brings_function
+        return cls.kernel_function == IN_NUMPY and not cls.brings_function
 
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of most parts, the fields are enough
         """Return the numbers that the function takes, for q parameters and λ of M₀ = λI.

@@ -21,7 +21,7 @@ Computation 4 (1992), sections 2 and 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ from dopt.evaluation import evaluation_set
 from dopt.models.base import MLP, Model
 from dopt.models.gaussian_process import GaussianProcess
 from dopt.randomness import initial_weights
-from dopt.spec.compatibility import Information, held_information
+from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Array
@@ -73,11 +73,7 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
             f"env.restarts of {system.name} is true, but the samples of a trial in one piece are "
             f"expected, as its record does not say where it restarted: leave such trials out."
         )
-    at = system.sampled_states(states)
-    known = system.known(tuple(at.T), tuple(inputs.T), system.parameters)
-    flow = np.stack(np.broadcast_arrays(*known, at[:, 0])[:-1], axis=-1)
-    observed = np.diff(states, axis=0) / system.dt - flow
-    return Samples(at, inputs, observed[:, list(system.learned_rows)])
+    return Samples(system.sampled_states(states), inputs, system.observed(states, inputs))
 
 
 def sample_loss(spec: TrialSpec, states: Array, inputs: Array) -> float:
@@ -269,17 +265,6 @@ def _fit_networks(
     spec: TrialSpec, points: Array, accelerations: Array, initial: Array, ridge: float, most: int
 ) -> tuple[Array, int, bool]:
     """Return the parameters of all networks, the most steps of one, and whether all converged."""
-    fits = [
-        _fit_network(spec, points, accelerations, member, ridge, most)
-        for member in initial.reshape(spec.model.n_members, -1)
-    ]
-    parameters, steps, converged = zip(*fits, strict=True)
-    return np.concatenate(parameters), max(steps), all(converged)
-
-
-def _fit_network(
-    spec: TrialSpec, points: Array, accelerations: Array, initial: Array, ridge: float, most: int
-) -> tuple[Array, int, bool]:
     from dopt.kernel.from_spec import network_of
     from dopt.kernel.learners import Problem, fit
     from dopt.kernel.pointers import compiled_for, kind_of
@@ -287,13 +272,17 @@ def _fit_network(
     network = network_of(spec.system, spec.model)
     features = spec.model.featurize(spec.system, points)
     columns = (np.array(rows.T, order="C") for rows in (features, accelerations))
-    problem, theta = Problem(network, initial, float(ridge), *columns), initial.copy()
-    kinds = tuple(map(kind_of, (problem, theta, most)))
-    # The machine code itself: called by its name, Numba would compile it again for its own type of
-    # a tuple of equal numbers.
-    code: Any = compiled_for("offline_fit", fit, kinds)
-    steps, converged = code(problem, theta, most)
-    return theta, steps, bool(converged)
+    given = Problem(network, initial, float(ridge), *columns)
+    parameters = initial.reshape(spec.model.n_members, -1).copy()
+    found: list[tuple[int, bool]] = []
+    for theta in parameters:
+        problem = given._replace(prior=theta.copy())
+        # The machine code itself: called by its name, Numba would compile it again for its own type
+        # of a tuple of equal numbers.
+        code = compiled_for(fit, tuple(map(kind_of, (problem, theta, most))))
+        found.append(code(problem, theta, most))
+    steps, converged = zip(*found, strict=True)
+    return parameters.ravel(), max(steps), all(converged)
 
 
 def _solve(
@@ -382,10 +371,7 @@ def _information(spec: TrialSpec) -> Information | None:
     system, model = spec.system, spec.model
     if model.n_members > 1 or model.structure == "conditioning" or system.n_measured:
         return None
-    found = held_information(
-        spec.policy, spec.learner, model.n_parameters(system), system.n_learned
-    )
-    return found if system.noise > 0.0 else None
+    return spec.config.information if system.noise > 0.0 else None
 
 
 def predicted_variances(

@@ -40,25 +40,6 @@ def predict(system: System, accelerations: Accelerations, states: Array, inputs:
 
     The system's integrator without noise; numbers that overflow become infinite or NaN.
     """
-    if system.integrator != "euler":
-        return _predict_in_stages(system, accelerations, states, inputs)
-    by_step = np.ascontiguousarray(np.moveaxis(inputs, (1, 2), (0, 1)))
-    visited = np.empty((len(by_step) + 1, system.n_states, len(states)))
-    visited[0] = states.T
-    rows = list(system.learned_rows)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for x, u, following in zip(visited, by_step, visited[1:], strict=False):
-            for row, known in enumerate(system.known(tuple(x), tuple(u), system.parameters)):
-                following[row] = known
-            following[rows] += accelerations(x.T, u.T).T
-            following *= system.dt
-            following += x
-    return visited[1:].swapaxes(1, 2)
-
-
-def _predict_in_stages(
-    system: System, accelerations: Accelerations, states: Array, inputs: Array
-) -> Array:
     visited = np.empty((inputs.shape[1] + 1, *states.shape))
     visited[0] = states
     with np.errstate(over="ignore", invalid="ignore"):

@@ -28,15 +28,14 @@ evaluated in double precision.
 
 
 class Buffers(NamedTuple):
-    """Scratch memory of an evaluation: flat activations and outputs of a block, and parameters."""
+    """Scratch memory of an evaluation.
 
-    hidden_single: Singles  # (L, w BLOCK)
-    outputs_single: Singles  # (r, BLOCK)
-    hidden: Matrix  # (L, w BLOCK)
-    outputs: Matrix  # (r, BLOCK)
-    thetas_single: Singles  # (E, q)
-    one_single: Singles  # (r, BLOCK) of one member
-    one: Matrix  # (r, BLOCK)
+    Flat activations, (L, w BLOCK), and outputs of a block, (r, BLOCK), of the mean and of a member.
+    """
+
+    single: tuple[Singles, Singles, Singles]
+    double: tuple[Matrix, Matrix, Matrix]
+    thetas: Singles  # (E, q)
 
 
 @compiled
@@ -58,35 +57,17 @@ def model_error(
     theta = thetas[0]
     if network.kind == ModelKind.LINEAR:
         return _linear_error(theta, points, start, stop)
-    r = buffers.outputs.shape[0]
-    if network.kind == ModelKind.GREY_BOX:
-        return _grey_box_error(plant, network, theta, points, start, stop, buffers.outputs)
-    if network.kind in (ModelKind.RANDOM_FEATURES, ModelKind.LINEAR_STATE):
-        W = theta.reshape(r, points.basis.shape[1])
-        return _combination_error(W, points, start, stop, buffers.outputs)
-    if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        alpha = mean_weights(network, theta, r)[:, : points.n_basis[0]]
-        return _process_error(alpha, points, start, stop, buffers.outputs)
-    hidden_single, outputs_single, hidden, outputs, thetas_single, one_single, one = buffers
+    if network.kind != ModelKind.MLP:
+        outputs = buffers.double[1]
+        return _other_error(plant, network, theta, points, start, stop, outputs)
+    single = buffers.thetas
     for k in range(thetas.shape[0]):
         for i in range(thetas.shape[1]):
-            thetas_single[k, i] = np.float32(thetas[k, i])
-    loss = _network_error(
-        network,
-        thetas_single,
-        points.single,
-        points,
-        start,
-        stop,
-        hidden_single,
-        outputs_single,
-        one_single,
-    )
+            single[k, i] = np.float32(thetas[k, i])
+    loss = _network_error(network, single, points.single, points, start, stop, buffers.single)
     if loss >= SINGLE_FLOOR * points.target_size:
         return loss
-    return _network_error(
-        network, thetas, points.features, points, start, stop, hidden, outputs, one
-    )
+    return _network_error(network, thetas, points.features, points, start, stop, buffers.double)
 
 
 @compiled
@@ -97,10 +78,9 @@ def _network_error(
     points: Evaluation,
     start: int,
     stop: int,
-    hidden: Real,
-    outputs: Real,
-    one: Real,
+    memory: tuple[Real, Real, Real],
 ) -> float:
+    hidden, outputs, one = memory
     total, count = 0.0, 0
     for block in range(start, stop):
         mean_forward(network, thetas, features[block], hidden, outputs, one)
@@ -111,38 +91,7 @@ def _network_error(
 
 
 @compiled
-def _combination_error(
-    W: Matrix, points: Evaluation, start: int, stop: int, outputs: Matrix
-) -> float:
-    """Return the error of a linear combination, (r, n), of the first n functions of the basis."""
-    total, count = 0.0, 0
-    for block in range(start, stop):
-        multiply(W, points.basis[block], outputs)
-        used = points.block_sizes[block]
-        total += _squared_errors(outputs, points.block_targets[block], used)
-        count += used
-    return float(np.sqrt(total / count)) if count else np.nan
-
-
-@compiled
-def _process_error(
-    alpha: Matrix, points: Evaluation, start: int, stop: int, outputs: Matrix
-) -> float:
-    """Return the error of means with weights (r, n), of which each kernel has a basis."""
-    total, count, G = 0.0, 0, points.basis.shape[0] // points.bounds[2]
-    r, n = alpha.shape[0] // G, alpha.shape[1]
-    for block in range(start, stop):
-        for g in range(G):
-            basis = points.basis[G * block + g, :n]
-            multiply(alpha[g * r : (g + 1) * r], basis, outputs[g * r : (g + 1) * r])
-        used = points.block_sizes[block]
-        total += _squared_errors(outputs, points.block_targets[block], used)
-        count += used
-    return float(np.sqrt(total / count)) if count else np.nan
-
-
-@compiled
-def _grey_box_error(
+def _other_error(
     plant: Plant,
     network: Network,
     theta: Vector,
@@ -151,10 +100,22 @@ def _grey_box_error(
     stop: int,
     outputs: Matrix,
 ) -> float:
-    total, count = 0.0, 0
+    """Return the error of a grey box, of means of processes, or of functions of a basis."""
+    total, count, n, r = 0.0, 0, points.n_basis[0], outputs.shape[0]
     for block in range(start, stop):
         used = points.block_sizes[block]
-        write_values(plant, network, theta, points.features[block, :, :used], outputs[:, :used])
+        if network.kind == ModelKind.GREY_BOX:
+            at = points.features[block, :, :used]
+            write_values(plant, network, theta, at, outputs[:, :used])
+        elif network.kind == ModelKind.GAUSSIAN_PROCESS:
+            G = points.basis.shape[0] // points.bounds[2]
+            alpha, rows = mean_weights(network, theta, r)[:, :n], r // G
+            for g in range(G):  # each kernel has a basis
+                out = outputs[g * rows : (g + 1) * rows]
+                multiply(alpha[g * rows : (g + 1) * rows], points.basis[G * block + g, :n], out)
+        else:
+            W = theta.reshape(r, points.basis.shape[1])
+            multiply(W, points.basis[block], outputs)
         total += _squared_errors(outputs, points.block_targets[block], used)
         count += used
     return float(np.sqrt(total / count)) if count else np.nan
@@ -188,14 +149,19 @@ def _linear_error(theta: Vector, points: Evaluation, start: int, stop: int) -> f
 def evaluation_buffers(network: Network, thetas: Matrix, r: int) -> Buffers:
     """Return the scratch memory of :func:`model_error`."""
     depth, room = network.offsets.shape[0] - 1, network.sizes[1] * BLOCK
+    single, double = np.float32, np.float64
     return Buffers(
-        np.empty((depth, room), np.float32),
-        np.empty((r, BLOCK), np.float32),
-        np.empty((depth, room)),
-        np.empty((r, BLOCK)),
-        np.empty(thetas.shape, np.float32),
-        np.empty((r, BLOCK), np.float32),
-        np.empty((r, BLOCK)),
+        (
+            np.empty((depth, room), single),
+            np.empty((r, BLOCK), single),
+            np.empty((r, BLOCK), single),
+        ),
+        (
+            np.empty((depth, room), double),
+            np.empty((r, BLOCK), double),
+            np.empty((r, BLOCK), double),
+        ),
+        np.empty(thetas.shape, single),
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from dopt.kernel.gaussian_process import add_sample, negative_evidence, refactor, thin
-from dopt.kernel.pointers import compiled_for, kind_of, path_of
+from dopt.kernel.pointers import compiled_for, kind_of
 from dopt.kernel.structs import Evaluation, Network, Posterior, Trial
 from dopt.learning import Conditioning
 from dopt.models.base import Model
@@ -94,7 +94,7 @@ def fit_numbers(
     spread = np.repeat(SPREADS, (p, 1, p, 1, 1))
     free = np.arange(2 * p + (3 if noise is None else 2))
     kinds = tuple(map(kind_of, (y, np.zeros((1, 1)), y, y, y)))
-    code: Any = compiled_for(path_of(negative_evidence), negative_evidence, kinds)
+    code: Any = compiled_for(negative_evidence, kinds)
     phi, y = np.ascontiguousarray(phi), np.ascontiguousarray(y)
 
     def cost(eta: Array) -> tuple[float, Array]:
@@ -218,7 +218,7 @@ class Samples(NamedTuple):
     def call(self, function: CompiledFunction, *more: Array) -> Any:
         """Call a compiled function of them."""
         kinds = tuple(map(kind_of, (*self, *more)))
-        return compiled_for(path_of(function), function, kinds)(*self, *more)
+        return compiled_for(function, kinds)(*self, *more)
 
     def copied(self) -> Samples:
         """Return a copy, whose factors are to begin where those in force do not."""

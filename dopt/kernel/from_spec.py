@@ -6,29 +6,20 @@ import functools
 
 import numpy as np
 
-from dopt.algorithm import FeatureKind, Form, Integrator, ModelKind, Score, switch_step
+from dopt.algorithm import FeatureKind, Form, Integrator, ModelKind
 from dopt.errors import SpecificationError
 from dopt.evaluation import EvaluationSet, box_states, domain_box, evaluation_set, task_states
 from dopt.kernel import information
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation import BLOCK
-from dopt.kernel.evidence import Evidence, is_tuned
 from dopt.kernel.linear_algebra import initial_covariance
 from dopt.kernel.structs import Members, Network
 from dopt.learning import GaussNewton, JointKalman, Learner
 from dopt.limits import Limits
-from dopt.models import (
-    MLP,
-    MODELS,
-    RFF,
-    AffineMLP,
-    GaussianProcess,
-    GreyBox,
-    Linear,
-    LinearState,
-)
+from dopt.models import MLP, MODELS, RFF, AffineMLP, GaussianProcess, GreyBox, Linear, LinearState
 from dopt.models.base import Model
+from dopt.models.linear import linear_terms
 from dopt.policies import (
     ICEM,
     DOptimal,
@@ -40,13 +31,12 @@ from dopt.policies import (
 )
 from dopt.policies.d_optimal import count_sketch
 from dopt.policies.held_candidates import HeldCandidates
-from dopt.policies.search import score_code
-from dopt.randomness import Draws, draw
-from dopt.spec.compatibility import Information, held_information, is_fresh
+from dopt.randomness import Draws
+from dopt.spec.compatibility import is_fresh
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.black_box import BlackBox, delay, differentiated, rate_factors
+from dopt.systems.black_box import BlackBox, delay, differentiated
 from dopt.types import Array, Integers, Matrix, Stack, Vector
 
 KINDS: dict[type[Model], ModelKind] = {
@@ -180,7 +170,7 @@ def _needs_inverse(config: TrialConfig) -> bool:
     """Return True if the policy or the learner reads M⁻¹; a learner that refits M may not."""
     policy = config.policy
     reads = isinstance(policy, InformationPolicy) and not isinstance(policy, ICEM)
-    return held_form(config) is not None and (reads or not _is_fitted(config.learner))
+    return config.information is not None and (reads or not _is_fitted(config.learner))
 
 
 def _is_fitted(learner: Learner) -> bool:
@@ -286,27 +276,17 @@ def n_learned_parameters(config: TrialConfig) -> int:
 
 def regularization_of(config: TrialConfig) -> float:
     """Return λ of M₀ = λI, 1 where there is no M."""
-    held = held_form(config)
-    return held.regularization if held else 1.0
-
-
-def held_form(config: TrialConfig) -> Information | None:
-    """Return the form in which M is held, None where there is no M."""
-    q, n_rows = (
-        config.model.n_member_parameters(config.system),
-        config.system.n_learned * config.system.horizon,
-    )
-    return held_information(config.policy, config.learner, q, n_rows)
+    return config.information.regularization if config.information else 1.0
 
 
 def form_of(config: TrialConfig) -> int:
     """Return the form of the information matrix, PRIMAL where no M is held."""
-    held = held_form(config)
+    held = config.information
     return int(Form[held.form.upper()] if held else Form.PRIMAL)
 
 
-FORMS_OF_NETWORKS = {
-    Form.PRIMAL: information.NETWORK,
+FORMS = {
+    Form.PRIMAL: information.PRIMAL,
     Form.DUAL: information.DUAL,
     Form.SKETCH: information.SKETCH,
 }
@@ -380,10 +360,9 @@ def algorithm_of(config: TrialConfig) -> args.Algorithm:
 
 def information_of(config: TrialConfig) -> args.Information:
     """Return the functions for the form that holds M, which are compiled when a trial runs."""
-    if not isinstance(config.policy, InformationPolicy) or held_form(config) is None:
+    if not isinstance(config.policy, InformationPolicy) or config.information is None:
         return information.ABSENT
-    network = isinstance(config.model, MLP)
-    form = FORMS_OF_NETWORKS[Form(form_of(config))] if network else information.OF_OTHER_MODELS
+    form = FORMS[Form(form_of(config))]
     if is_fresh(config.policy):
         form = information.FRESH  # which goes with the primal form
     searches = isinstance(config.policy, (Search, ICEM))
@@ -396,32 +375,37 @@ def information_of(config: TrialConfig) -> args.Information:
 def _search(config: TrialConfig) -> args.Search:
     """Return the plans of a policy that searches."""
     policy, system, q = config.policy, config.system, n_learned_parameters(config)
-    steps, score, held = 0, Score.JOINT, held_form(config)
-    candidates = np.zeros((0, system.n_inputs))
-    if isinstance(policy, Search):
-        steps, score = policy.steps(system), score_code(policy)
-        candidates = policy.compared_inputs(system)
-    elif isinstance(policy, HeldCandidates):
-        steps = policy.lookahead + system.lead_steps
-        candidates = policy.compared_inputs(system)
-    states = np.zeros((0, system.n_states))
-    if isinstance(policy, TaskOptimal):
-        states = task_states(system, policy)
-    if isinstance(policy, ICEM) and policy.task_count:
-        states = box_states(system)
-    return args.Search(
-        candidates,
-        int(score),
-        steps,
-        switch_step(steps),
-        policy.stride_of(system) if isinstance(policy, Lookahead) else 1,
-        policy.budget_us if isinstance(policy, Search) else 0.0,
-        states,
-        domain_box(system, policy.domain) if isinstance(policy, ICEM) else np.zeros((2, 0)),
-        policy.starts(q, system.n_learned) if isinstance(policy, EOptimal) else np.zeros((0, q)),
-        policy.subspace if isinstance(policy, EOptimal) else 0,
-        held.noise_variance**-0.5 if held else 1.0,
+    found = args.Search(
+        np.zeros((0, system.n_inputs)),
+        np.zeros((0, system.n_states)),
+        np.zeros((2, 0)),
+        np.zeros((0, q)),
+        config.information.noise_variance**-0.5 if config.information else 1.0,
     )
+    if isinstance(policy, (Search, HeldCandidates)):
+        steps = policy.steps(system)
+        candidates = policy.compared_inputs(system)
+        found = found._replace(candidates=candidates, steps=steps, switch=steps // 2)
+    if isinstance(policy, Search):
+        found = found._replace(score=int(policy.score), budget_us=policy.budget_us)
+    if isinstance(policy, Lookahead):
+        found = found._replace(stride=policy.stride_of(system))
+    if isinstance(policy, TaskOptimal):
+        found = found._replace(task_states=task_states(system, policy))
+    if isinstance(policy, EOptimal):
+        starts = policy.starts(q, system.n_learned)
+        found = found._replace(starts=starts, subspace=policy.subspace)
+    if isinstance(policy, ICEM):
+        names = ("stride", "hold", "plans", "iterations", "elites", "task_count")
+        found = found._replace(
+            task_states=box_states(system) if policy.task_count else found.task_states,
+            domain=domain_box(system, policy.domain),
+            score=int(policy.score),
+            steps=policy.lookahead,
+            replan_every=getattr(policy, "replan_every", 1),
+            **{name: getattr(policy, name) for name in names},
+        )
+    return found
 
 
 def limits_of(config: TrialConfig) -> args.Limits:
@@ -445,13 +429,14 @@ def limits_of(config: TrialConfig) -> args.Limits:
 def sensors_of(config: TrialConfig) -> args.Sensors:
     """Return what is measured of the states of a configuration; nothing where all are known."""
     system, estimates = config.system, config.learner.estimates_states
+    positions, factors = differentiated(system) if system.measured_states else ([], [])
     return args.Sensors(
         system.output_rows,
         np.array(system.measured_states, dtype=np.int64),
         np.array(system.measurement_noise, dtype=float) ** 2,
         np.array(system.output_quanta, dtype=float),
-        np.array(differentiated(system) if system.measured_states else [], dtype=np.int64),
-        np.array(rate_factors(system) if system.measured_states else []),
+        np.array(positions, dtype=np.int64),
+        np.array(factors, dtype=float),
         0.0 if estimates else system.velocity_cutoff,
         delay(system) if system.n_measured and not estimates else 0.0,
         np.zeros(system.n_states),  # the initial state of a simulation is known
@@ -464,77 +449,38 @@ def randomness_of(spec: TrialSpec, draws: Draws) -> args.Randomness:
     return drawn._replace(parameters=drawn.parameters[: n_learned_parameters(spec.config)])
 
 
-class KernelState:
-    """Observations and learned parameters of a trial in the compiled kernel.
-
-    Attributes
-    ----------
-    trial : Trial
-        Arguments of the compiled functions.
-    state, record : State, Record
-        Its arrays that they write in place.
-    """
-
-    def __init__(self, spec: TrialSpec) -> None:
-        draws = draw(spec)
-        self.spec, self.trial = spec, trial_of(spec, draws)
-        self.state, self.record = self.trial.state, self.trial.record
-        self.evidence = Evidence(spec, self.trial) if is_tuned(spec.model) else None
-        n_fixed = spec.model.n_fixed_parameters(spec.system)
-        self._fixed = draws.weights[len(draws.weights) - n_fixed :]
-
-    @property
-    def parameters(self) -> Array:
-        """Parameters of the model, (q,), of all members, and those that stay as they were drawn."""
-        if self.state.members.parameters.shape[0] > 0:
-            return self.state.members.parameters.flatten()
-        return np.concatenate([self.state.theta, self._fixed])
-
-    @property
-    def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet.
-
-        Of a simulation they are the true ones.
-        """
-        return self.record.true_states
-
-
 def evaluation_points(system: System, model: Model, network: args.Network) -> args.Evaluation:
     """Return the points of a system in the form that its model takes."""
-    points = evaluation_set(system)
+    points, none = evaluation_set(system), np.zeros((0, 0, 0))
+    at, n_grid = system.points(points.states, points.inputs), points.n_grid
+    found = args.Evaluation(
+        single=none.astype(np.float32),
+        features=none,
+        basis=none,
+        n_basis=np.zeros(1, dtype=np.int64),
+        block_targets=none,
+        block_sizes=np.zeros(0, dtype=np.int64),
+        regressors=none,
+        targets=np.zeros((0, 0)),
+        states=at if len(system.history) > 1 else at[:0],
+        bounds=np.array([0, n_grid, len(at)]),
+        target_size=_size(system, points),
+    )
     if network.kind == ModelKind.LINEAR:
-        return _linear_evaluation(system, points)
-    features = model.featurize(system, model.points(system, points.states, points.inputs))
-    columns = [features.T, points.accelerations.T]
-    parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
-    blocks_of_features, targets, sizes = zip(
-        *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
+        offset, regressors = linear_terms(system, at)
+        targets = np.ascontiguousarray(points.accelerations - offset)
+        return found._replace(regressors=np.ascontiguousarray(regressors), targets=targets)
+    features = model.featurize(system, model.points(system, points.states, points.inputs)).T
+    truth, parts = points.accelerations.T, (slice(0, n_grid), slice(n_grid, None))
+    cut = (_blocks(features[:, part], truth[:, part]) for part in parts)
+    blocks, block_targets, sizes = zip(*cut, strict=True)
+    return found._replace(
+        single=np.concatenate(blocks).astype(np.float32),
+        features=np.concatenate(blocks),
+        block_targets=np.concatenate(block_targets),
+        block_sizes=np.concatenate(sizes),
+        bounds=np.cumsum([0, *map(len, sizes)], dtype=np.int64),
     )
-    blocks = np.concatenate(blocks_of_features)
-    return args.Evaluation(
-        blocks.astype(np.float32),
-        blocks,
-        np.zeros((0, 0, 0)),
-        np.zeros(1, dtype=np.int64),
-        np.concatenate(targets),
-        np.concatenate(sizes),
-        np.zeros((0, 0, 0)),
-        np.zeros((0, 0)),
-        _followed(system, points),
-        _bounds(*map(len, sizes)),
-        _size(system, points),
-    )
-
-
-def _bounds(n_grid: int, n_reachable: int) -> Integers:
-    """Return where the grid begins and ends, and where the reachable set ends."""
-    return np.cumsum([0, n_grid, n_reachable], dtype=np.int64)
-
-
-def _followed(system: System, points: EvaluationSet) -> Array:
-    """Return the states at which the truth is evaluated again at each step."""
-    followed = system.points(points.states, points.inputs)
-    return followed if len(system.history) > 1 else followed[:0]
 
 
 def points_of_trial(points: args.Evaluation, network: args.Network) -> args.Evaluation:
@@ -573,28 +519,6 @@ def _blocks(features: Array, targets: Array) -> tuple[Stack, Stack, Integers]:
         return np.ascontiguousarray(padded.reshape(len(columns), -1, BLOCK).swapaxes(0, 1))
 
     return cut(features), cut(targets), sizes
-
-
-def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation:
-    at = system.points(points.states, points.inputs)
-    offset, *units = (
-        np.stack(np.broadcast_arrays(*system.accelerations(tuple(at.T), form)), axis=-1)
-        for form in system.linear_form
-    )
-    regressors = np.stack([unit - offset for unit in units], axis=-1)
-    return args.Evaluation(
-        np.zeros((0, 0, 0), dtype=np.float32),
-        np.zeros((0, 0, 0)),
-        np.zeros((0, 0, 0)),
-        np.zeros(1, dtype=np.int64),
-        np.zeros((0, 0, 0)),
-        np.zeros(0, dtype=np.int64),
-        np.ascontiguousarray(regressors),
-        np.ascontiguousarray(points.accelerations - offset),
-        _followed(system, points),
-        _bounds(points.n_grid, len(points.states) - points.n_grid),
-        _size(system, points),
-    )
 
 
 def _size(system: System, points: EvaluationSet) -> float:

@@ -144,17 +144,6 @@ def write_mean_at(network: Network, theta: Vector, phi: Vector, row: Vector, out
         out[k] = inner(row, alpha[k, : row.shape[0]])
 
 
-@compiled
-def write_means(network: Network, theta: Vector, states: Matrix, outputs: Matrix) -> None:
-    """Write the posterior mean, (r, N), at states, (N, d)."""
-    phi, value = np.empty(network.sizes[0]), np.empty(outputs.shape[0])
-    row = np.empty(network.process.n_samples[0])
-    for i in range(states.shape[0]):
-        features_at(network, states[i], phi)
-        write_mean_at(network, theta, phi, row, value)
-        outputs[:, i] = value
-
-
 @called_from_python
 def add_sample(
     network: Network, theta: Vector, posterior: Posterior, x: Vector, target: Vector
@@ -184,10 +173,8 @@ def add_sample(
         _merge(network, theta, posterior, phi, target)
         return
     posterior.counts[n] = 1.0
-    for k in range(r):
-        posterior.targets[k, n] = target[k]
-    for j in range(p):
-        others[j, n] = phi[j]
+    copy_into(target, posterior.targets[:, n])
+    copy_into(phi, others[:, n])
     network.process.n_samples[0] = n + 1
     for k in range(r):
         factor = factor_of(posterior, k % numbers.shape[0])
@@ -208,8 +195,7 @@ def _merge(
     numbers, others = numbers_of(network, theta, r), sample_features(network, theta)
     nearest, row = _nearest(numbers, phi, others, np.arange(n)), np.empty(n)
     here, there, at = np.empty(r), np.empty(r), np.empty(p)
-    for j in range(p):
-        at[j] = others[j, nearest]
+    copy_into(others[:, nearest], at)
     write_mean_at(network, theta, phi, row, here)
     write_mean_at(network, theta, at, row, there)
     count = posterior.counts[nearest]
@@ -248,8 +234,7 @@ def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
     left, chosen, taken = np.empty((G, n)), np.empty(keep, np.int64), np.zeros(n, np.bool_)
     row, value = np.empty(n), np.empty(r)
     for i in range(n):
-        for j in range(p):
-            at[j] = phi[j, i]
+        copy_into(phi[:, i], at)
         write_mean_at(network, theta, at, row, value)
         means[:, i] = value
         for g in range(G):
@@ -263,8 +248,7 @@ def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
         if taken[best] or left[:, best].max() < LITTLE:
             break
         taken[best], chosen[m] = True, best
-        for j in range(p):
-            at[j] = phi[j, best]
+        copy_into(phi[:, best], at)
         for g in range(G):
             row, noise = rows[g, m], numbers[g, 2 * p + 2]
             write_kernel(numbers[g], at, phi, 0, row)
@@ -278,8 +262,7 @@ def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
     for i in range(n):
         if taken[i]:
             continue
-        for j in range(p):
-            at[j] = phi[j, i]
+        copy_into(phi[:, i], at)
         nearest = _nearest(numbers, at, phi, chosen[:m])
         share = posterior.counts[i] / (posterior.counts[nearest] + posterior.counts[i])
         for k in range(r):
@@ -289,10 +272,8 @@ def thin(network: Network, theta: Vector, posterior: Posterior) -> None:
     order = np.sort(chosen[:m])
     for i in range(m):
         posterior.counts[i] = posterior.counts[order[i]]
-        for k in range(r):
-            targets[k, i] = targets[k, order[i]]
-        for j in range(p):
-            phi[j, i] = phi[j, order[i]]
+        copy_into(targets[:, order[i]], targets[:, i])
+        copy_into(phi[:, order[i]], phi[:, i])
     phi[:, m:n] = 0.0
     mean_weights(network, theta, r)[:, m:n] = 0.0
     network.process.n_samples[0] = m
@@ -342,8 +323,7 @@ def _write_covariance(numbers: Vector, phi: Matrix, counts: Vector, E: Matrix, K
     exponential[p + 1 : 2 * p + 2] = 0.0
     at = np.empty(p)
     for i in range(n):
-        for j in range(p):
-            at[j] = phi[j, i]
+        copy_into(phi[:, i], at)
         write_kernel(exponential, at, phi, i, E[i, i:])
         row, smooth = K[i, i:], E[i, i:]
         for b in range(row.shape[0]):
@@ -474,8 +454,7 @@ def add_to_points(network: Network, theta: Vector, r: int, points: Evaluation) -
     numbers, phi = numbers_of(network, theta, r), sample_features(network, theta)
     G, at, last = numbers.shape[0], np.empty(network.sizes[0]), network.process.n_samples[0]
     for n in range(points.n_basis[0], last):
-        for j in range(at.shape[0]):
-            at[j] = phi[j, n]
+        copy_into(phi[:, n], at)
         for block in range(points.bounds[2]):
             for g in range(G):
                 out = points.basis[G * block + g, n]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from typing import NamedTuple
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -51,14 +51,6 @@ def pointer_to(struct: NumbaType) -> StructPointer:
     return StructPointer(struct)
 
 
-def field_address(
-    context: NumbaType, builder: NumbaType, struct: NumbaType, address: NumbaType, name: str
-) -> NumbaType:
-    """Generate the address of a field of a named tuple at an address."""
-    start = builder.bitcast(address, context.get_value_type(struct).as_pointer())
-    return cgutils.gep_inbounds(builder, start, 0, struct.fields.index(name))
-
-
 @register_model(StructPointer)
 class _Address(models.OpaqueModel):  # type: ignore[misc]
     """A pointer in machine code."""
@@ -76,7 +68,8 @@ class _Fields(AttributeTemplate):  # type: ignore[misc]
 def _read_field(
     context: NumbaType, builder: NumbaType, kind: StructPointer, value: NumbaType, name: str
 ) -> NumbaType:
-    address = field_address(context, builder, kind.struct, value, name)
+    start = builder.bitcast(value, context.get_value_type(kind.struct).as_pointer())
+    address = cgutils.gep_inbounds(builder, start, 0, kind.struct.fields.index(name))
     field = kind.field(name)
     if isinstance(field, StructPointer):
         return builder.bitcast(address, cgutils.voidptr_t)
@@ -94,9 +87,9 @@ class HeldTrialType(types.StructRef):  # type: ignore[misc]  # numba has no type
 
 
 class HeldTrial(structref.StructRefProxy):  # type: ignore[misc]
-    """A trial and the functions that its steps call."""
+    """A trial and the functions that its steps call; or a plant."""
 
-    trial: Trial
+    trial: Any  # Trial or Plant
     steps: Steps
 
 
@@ -107,15 +100,15 @@ structref.define_proxy(HeldTrial, HeldTrialType, FIELDS)
 
 @or_plain(Held)
 @compiled
-def hold(trial: Trial, steps: Steps) -> HeldTrial:
-    """Return a trial and its functions as one; it writes into the same arrays."""
+def hold(trial: Trial | Plant, steps: Steps | int) -> HeldTrial:
+    """Return a trial, or a plant, and its functions as one; it writes into the same arrays."""
     return HeldTrial(trial, steps)
 
 
 @or_plain(plain_trial_in)
 @intrinsic
 def trial_in(typing_context: NumbaType, held: NumbaType) -> NumbaType:  # noqa: ARG001  # Numba's signature
-    """Return a pointer to the trial that is held."""
+    """Return a pointer to the trial, or plant, that is held."""
 
     def generate(  # Numba's signature
         context: NumbaType,
@@ -132,30 +125,3 @@ def trial_in(typing_context: NumbaType, held: NumbaType) -> NumbaType:  # noqa: 
         return builder.bitcast(address, cgutils.voidptr_t)
 
     return pointer_to(held.field_dict["trial"])(held), generate
-
-
-@structref.register
-class HeldPlantType(types.StructRef):  # type: ignore[misc]  # numba has no types
-    """Type of :class:`HeldPlant` in compiled code."""
-
-
-class HeldPlant(structref.StructRefProxy):  # type: ignore[misc]
-    """A plant that is passed on as one word."""
-
-    plant: Plant
-
-
-class PlainPlant(NamedTuple):
-    """What stands for it in the interpreter (:mod:`dopt.kernel.plain`)."""
-
-    plant: Plant
-
-
-structref.define_proxy(HeldPlant, HeldPlantType, ("plant",))
-
-
-@or_plain(PlainPlant)
-@compiled
-def hold_plant(plant: Plant) -> HeldPlant:
-    """Return a plant as one."""
-    return HeldPlant(plant)

@@ -38,13 +38,11 @@ from dopt.kernel.model import (
     all_components,
     linearization_at,
     parameter_rows,
+    write_gradients,
     write_jacobian,
-    write_model_gradients,
-    write_network_gradients,
-    write_normal_equations,
 )
 from dopt.kernel.network import features_at, multiply_vector, output_inputs_along, output_inputs_at
-from dopt.kernel.normal_equations import normal_matrix
+from dopt.kernel.normal_equations import write_normal
 from dopt.kernel.structs import (
     Covariance,
     Dual,
@@ -102,9 +100,12 @@ def planned_forms(covariance: Covariance, G: Matrix) -> Matrix:
 
 
 @compiled
-def add_model_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
+def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
     r = plant.learned_rows.shape[0]
+    if network.kind == ModelKind.MLP:
+        write_jacobian(network, state.theta, x, deferred(state.covariance, r), np.empty(r))
+        return
     rows = np.empty((r, state.theta.shape[0]))
     parameter_rows(plant, network, state.theta, x, rows, np.empty(r))
     places = deferred(state.covariance, r)
@@ -113,39 +114,12 @@ def add_model_rows(plant: Plant, network: Network, state: State, x: Vector) -> N
 
 
 @compiled
-def model_forms(
-    plant: Plant,
-    network: Network,
-    state: State,
-    bar: Vector,
-    columns: Matrix,
-    component: int,
+def forms(
+    plant: Plant, network: Network, state: State, bar: Vector, columns: Matrix, component: int
 ) -> Matrix:
     """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
     G = planned(state.covariance, 1 + columns.shape[0])
-    write_model_gradients(plant, network, state.theta, bar, columns, component, G)
-    return planned_forms(state.covariance, G)
-
-
-@compiled
-def add_network_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
-    """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
-    r = plant.learned_rows.shape[0]
-    write_jacobian(network, state.theta, x, deferred(state.covariance, r), np.empty(r))
-
-
-@compiled
-def network_forms(
-    plant: Plant,  # noqa: ARG001
-    network: Network,
-    state: State,
-    bar: Vector,
-    columns: Matrix,
-    component: int,
-) -> Matrix:
-    """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
-    G = planned(state.covariance, 1 + columns.shape[0])
-    write_network_gradients(network, state.theta, bar, columns, component, G)
+    write_gradients(plant, network, state.theta, bar, columns, component, G)
     return planned_forms(state.covariance, G)
 
 
@@ -160,38 +134,20 @@ def add_fresh_rows(plant: Plant, network: Network, state: State, x: Vector) -> N
     n, q = visited.n_states[0], state.theta.shape[0]
     phi = np.empty(network.feature_kinds.shape[0])
     features_at(network, x, phi)
-    for i in range(phi.shape[0]):
-        visited.features[i, n] = phi[i]
+    copy_into(phi, visited.features[:, n])
     visited.n_states[0] = n + 1
     if (n + 1) % visited.refresh_every != 0:
-        if network.kind == ModelKind.MLP:
-            add_network_rows(plant, network, state, x)
-        else:
-            add_model_rows(plant, network, state, x)
+        add_rows(plant, network, state, x)
         return
-    normal, r = np.empty((q, q)), plant.learned_rows.shape[0]
-    seen = visited.features[:, : n + 1].copy()
-    if network.kind == ModelKind.MLP:
-        normal_matrix(network, state.theta, seen, r, normal)
-    else:
-        nothing, slope = np.zeros((r, n + 1)), np.empty(q)
-        write_normal_equations(plant, network, state.theta, seen, nothing, normal, slope)
+    normal, slope, seen = np.empty((q, q)), np.empty(q), visited.features[:, : n + 1].copy()
+    nothing = np.zeros((plant.learned_rows.shape[0], n + 1))
+    write_normal(plant, network, state.theta, seen, nothing, normal, slope)
     for i in range(q):
         normal[i, i] += visited.regularization
     if not (factorize(normal) and write_inverse(normal, covariance.upper)):
         state.theta[:] = np.nan
     replaced(covariance)
     covariance.n_deferred[0] = 0
-
-
-@compiled
-def fresh_forms(
-    plant: Plant, network: Network, state: State, bar: Vector, columns: Matrix, component: int
-) -> Matrix:
-    """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
-    if network.kind == ModelKind.MLP:
-        return network_forms(plant, network, state, bar, columns, component)
-    return model_forms(plant, network, state, bar, columns, component)
 
 
 BLOCK_BYTES = 2**18
@@ -509,11 +465,10 @@ def _add(sketch: Sketch, start: int, values: Vector, out: Vector) -> None:
 
 
 ABSENT = Information(add_nothing, undefined_forms)
-NETWORK = Information(add_network_rows, network_forms)
-OF_OTHER_MODELS = Information(add_model_rows, model_forms)
-FRESH = Information(add_fresh_rows, fresh_forms)
+PRIMAL = Information(add_rows, forms)
+FRESH = Information(add_fresh_rows, forms)
 DUAL = Information(add_dual_rows, dual_forms)
 SKETCH = Information(add_sketched_rows, sketched_forms)
 
-FORMS = (ABSENT, NETWORK, OF_OTHER_MODELS, DUAL, SKETCH, FRESH)
+FORMS = (ABSENT, PRIMAL, DUAL, SKETCH, FRESH)
 """All forms, in the order in which they are compiled."""

@@ -10,13 +10,12 @@ import numpy as np
 from dopt.algorithm import RUNGE_KUTTA_SHARES, RUNGE_KUTTA_WEIGHTS, Integrator
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python, compiled, copy_into
-from dopt.kernel.held import HeldPlant
+from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.model import (
     model_accelerations,
     model_point,
     plant_point,
     sampled_state,
-    write_point_features,
 )
 from dopt.kernel.structs import Network, Plant, Trial
 from dopt.types import Matrix, Stack, Vector
@@ -226,9 +225,9 @@ def point_columns(network: Network, columns: Matrix) -> Matrix:
 
 
 @called_from_python
-def follow_equations(held: HeldPlant, parameters: Vector, inputs: Stack, states: Stack) -> None:
+def follow_equations(held: HeldTrial, parameters: Vector, inputs: Stack, states: Stack) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
-    plant = held.plant
+    plant: Plant = trial_in(held)
     for t in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
             next_true_state(plant, parameters, states[t, i], inputs[t, i], states[t + 1, i])
@@ -236,13 +235,13 @@ def follow_equations(held: HeldPlant, parameters: Vector, inputs: Stack, states:
 
 @called_from_python
 def follow_network(
-    held: HeldPlant, network: Network, thetas: Matrix, inputs: Stack, states: Stack
+    held: HeldTrial, network: Network, thetas: Matrix, inputs: Stack, states: Stack
 ) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m).
 
     They follow the mean of the networks with parameters ``thetas``, (E, q).
     """
-    plant = held.plant
+    plant: Plant = trial_in(held)
     n, d, r = inputs.shape[1], states.shape[2], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     rate, value, total = np.empty(d), np.empty(r), np.empty((n, d))
@@ -252,7 +251,8 @@ def follow_network(
     for t in range(inputs.shape[0]):
         states[t + 1] = states[t]
         for stage in range(n_stages(plant)):
-            write_point_features(network, states[t + 1], inputs[t], features)
+            points = np.concatenate((states[t + 1], inputs[t]), axis=1)
+            nn.write_features(network, points, features)
             nn.mean_forward(network, thetas, features, hidden, outputs, one)
             for i in range(n):
                 x, following = states[t, i], states[t + 1, i]

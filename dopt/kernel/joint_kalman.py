@@ -16,20 +16,14 @@ import numpy as np
 from dopt.algorithm import MOST_NOISE_FACTORS, NO_GROWTH, NOISE_FACTORS, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import next_model_state
-from dopt.kernel.learners import filter_step, model_rows, sampled_point, squared_distance
-from dopt.kernel.linear_algebra import (
-    factorize,
-    quadratic_forms,
-    replaced,
-    solve,
-    write_inverse,
-)
-from dopt.kernel.model import model_point, state_between
+from dopt.kernel.learners import filter_step, sampled_point, squared_distance
+from dopt.kernel.linear_algebra import factorize, quadratic_forms, replaced, solve, write_inverse
+from dopt.kernel.model import model_point, model_rows, state_between
 from dopt.kernel.sensors import (
     begin,
     correct_covariance,
     correct_sensitivity,
-    covariances,
+    innovation,
     move_covariance,
     move_sensitivity,
     output_sensitivity,
@@ -79,12 +73,8 @@ def update(trial: Trial, t: int) -> None:
     rows, residual, change = np.empty((1, q)), np.empty(1), np.empty(q)
     row = np.empty(q)
     for i in range(sensors.output_matrix.shape[0]):
-        output = sensors.output_matrix[i]
-        gain = covariances(P, output)
-        error = estimate.outputs[t, i] - inner(output, x)
-        variance = inner(output, gain) + sensors.variances[i]
-        gain /= variance
-        output_sensitivity(sensitivity, output, row)
+        error, gain, variance = innovation(trial, t, i, x, P)
+        output_sensitivity(sensitivity, sensors.output_matrix[i], row)
         scale = 1.0 / np.sqrt(variance)
         rows[0] = scale * row
         residual[0] = scale * error
@@ -210,16 +200,12 @@ def run_filter(trial: Trial, n: int, rows: Matrix, errors: Vector) -> float:
         move_covariance(A, noise, plant.learned_rows, dt, P)
         x[:] = following
         for i in range(n_measured):
-            output = sensors.output_matrix[i]
-            gain = covariances(P, output)
-            error = estimate.outputs[t, i] - inner(output, x)
-            variance = inner(output, gain) + sensors.variances[i]
-            gain /= variance
+            error, gain, variance = innovation(trial, t, i, x, P)
             total += error * error / variance + np.log(variance)
             correct_covariance(P, gain, variance)
             if with_rows:
                 scale = 1.0 / np.sqrt(variance)
-                output_sensitivity(sensitivity, output, row)
+                output_sensitivity(sensitivity, sensors.output_matrix[i], row)
                 rows[t * n_measured + i] = scale * row
                 errors[t * n_measured + i] = scale * error
                 correct_sensitivity(gain, row, sensitivity)

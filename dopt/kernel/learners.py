@@ -51,17 +51,16 @@ from dopt.kernel.linear_algebra import (
     solve_columns,
     write_inverse,
 )
-from dopt.kernel.model import (
-    model_point,
-    parameter_rows,
-    sampled_state,
-    squared_error,
-    write_jacobian,
-    write_normal_equations,
-)
+from dopt.kernel.model import model_point, model_rows, sampled_state, write_normal_equations
 from dopt.kernel.network import features_at, loss_gradient
-from dopt.kernel.normal_equations import errors_of, normal_equations, write_products
-from dopt.kernel.structs import Covariance, Network, Plant, State, Trial
+from dopt.kernel.normal_equations import (
+    errors_of,
+    normal_equations,
+    sum_of_squares,
+    write_normal,
+    write_products,
+)
+from dopt.kernel.structs import Covariance, Network, State, Trial
 from dopt.kernel.vectors import LANES, add_multiple, inner, multiply_add
 from dopt.types import Matrix, Vector
 
@@ -81,10 +80,8 @@ def store_sample(
     slot = t % features.shape[1]
     phi = np.empty(network.feature_kinds.shape[0])
     features_at(network, x, phi)
-    for i in range(phi.shape[0]):
-        features[i, slot] = phi[i]
-    for k in range(target.shape[0]):
-        targets[k, slot] = target[k]
+    copy_into(phi, features[:, slot])
+    copy_into(target, targets[:, slot])
 
 
 @compiled
@@ -109,34 +106,18 @@ def adam_step(trial: Trial, step: int, features: Matrix, targets: Matrix) -> Non
         normal = np.empty((theta.shape[0], theta.shape[0]))
         write_normal_equations(trial.plant, network, theta, features, targets, normal, gradient)
         gradient *= -2.0 / features.shape[1]
-    adam_update(trial.algorithm.learner, step, theta, state.moment_1, state.moment_2, gradient)
-
-
-@compiled
-def adam_update(
-    numbers: Vector, t: int, theta: Vector, moment_1: Vector, moment_2: Vector, gradient: Vector
-) -> None:
-    """Move θ, (q,), and the moments, (q,), along a gradient: step t + 1."""
-    learning_rate, beta_1, beta_2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
-    correction_1, correction_2 = _sum_of_weights(beta_1, t + 1), _sum_of_weights(beta_2, t + 1)
-    rest_1, rest_2, rate, scale = (
-        1.0 - beta_1,
-        1.0 - beta_2,
-        learning_rate / correction_1,
-        1.0 / correction_2,
-    )
+    numbers, moment_1, moment_2 = trial.algorithm.learner, state.moment_1, state.moment_2
+    beta_1, beta_2, epsilon = numbers[1], numbers[2], numbers[3]
+    rest_1, rest_2 = 1.0 - beta_1, 1.0 - beta_2
+    # A moment of decay β gives to n gradients weights whose sum is 1 - βⁿ.
+    rate = numbers[0] / float(1.0 - beta_1 ** (step + 1))
+    scale = 1.0 / float(1.0 - beta_2 ** (step + 1))
     for i in range(gradient.shape[0]):
         g = gradient[i]
         moment_1[i] = multiply_add(beta_1, moment_1[i], rest_1 * g)
         moment_2[i] = multiply_add(beta_2, moment_2[i], rest_2 * g * g)
         deviation = np.sqrt(moment_2[i] * scale)
         theta[i] -= rate * moment_1[i] / (deviation + epsilon)
-
-
-@compiled
-def _sum_of_weights(beta: float, n: int) -> float:
-    """Return the sum of the weights that a moment of decay β gives to n gradients."""
-    return float(1.0 - beta**n)
 
 
 @compiled
@@ -155,19 +136,7 @@ def learn_from_replay(trial: Trial, t: int, target: Vector) -> None:
                 features[i, j] = seen[i, place]
             for k in range(targets.shape[0]):
                 targets[k, j] = observed[k, place]
-        step = t * steps + s
-        adam_step(trial, step, features, targets)
-
-
-@compiled
-def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
-    """Return J, (r, q), at a point, and write a_θ, (r,), there."""
-    rows = np.empty((value.shape[0], theta.shape[0]))
-    if network.kind == ModelKind.MLP:
-        write_jacobian(network, theta, x, rows, value)
-    else:
-        parameter_rows(plant, network, theta, x, rows, value)
-    return rows
+        adam_step(trial, t * steps + s, features, targets)
 
 
 @compiled
@@ -216,12 +185,18 @@ def _read_column(covariance: Covariance, i: int, out: Vector) -> None:
 @compiled
 def learn_recursively(trial: Trial, t: int, target: Vector) -> None:
     """Take the least-squares step on the observed accelerations, (r,), and update M."""
-    theta, covariance = trial.state.theta, trial.state.covariance
-    residuals = np.empty(target.shape[0])
-    rows = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), residuals)
+    rows, residuals = _newest_rows(trial, t, target)
+    filter_step(trial.state.covariance, trial.state.theta, rows, residuals)
+
+
+@compiled
+def _newest_rows(trial: Trial, t: int, target: Vector) -> tuple[Matrix, Vector]:
+    """Return J, (r, q), at the sample of step t, and what the model leaves of it, (r,)."""
+    residuals, point = np.empty(target.shape[0]), sampled_point(trial, t)
+    rows = model_rows(trial.plant, trial.network, trial.state.theta, point, residuals)
     for k in range(target.shape[0]):
         residuals[k] = target[k] - residuals[k]
-    filter_step(covariance, theta, rows, residuals)
+    return rows, residuals
 
 
 @compiled
@@ -243,18 +218,15 @@ def filter_sample(
     underweighting: float,
 ) -> None:
     """Update θ and M by the sample of step t, after M has faded by a factor."""
-    theta, covariance = trial.state.theta, trial.state.covariance
-    residuals = np.empty(target.shape[0])
-    rows = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), residuals)
-    for k in range(target.shape[0]):
-        residuals[k] = target[k] - residuals[k]
+    covariance = trial.state.covariance
+    rows, residuals = _newest_rows(trial, t, target)
     if forgetting < 1.0:
         forget(covariance, forgetting, t, renewed, renewal)
     if underweighting > 0.0:
         whiten(covariance, rows, residuals, noise_variance, underweighting)
     else:
         scale_by_noise(rows, residuals, noise_variance)
-    filter_step(covariance, theta, rows, residuals)
+    filter_step(covariance, trial.state.theta, rows, residuals)
 
 
 @compiled
@@ -314,11 +286,7 @@ def learn_fitted(trial: Trial, t: int, target: Vector) -> None:
     ridge, factor = numbers[0] * noise_variance, np.empty((q, q))
     definite, damped = True, numbers[4] > 0.0
     for _ in range(steps):
-        definite = definite and take_step(
-            *(trial.plant, trial.network, state.theta, state.prior, ridge, features, targets),
-            factor,
-            damped,
-        )
+        definite = definite and take_step(trial, ridge, features, targets, factor, damped)
     if not (definite and _write_information(state, factor, noise_variance)):
         state.theta[:] = np.nan  # which ends the trial as diverged
 
@@ -329,27 +297,19 @@ def _write_information(state: State, factor: Matrix, noise_variance: float) -> b
 
     Given is the factor of ρ M.
     """
-    finite, covariance = True, state.covariance
+    finite, covariance, upper = True, state.covariance, state.covariance.upper
     if state.factor.shape[0] > 0:
         state.factor[:] = factor / np.sqrt(noise_variance)
     if covariance.size > 0:
-        finite = write_inverse(factor, covariance.upper)
-        _scale(covariance.upper, noise_variance)
+        finite = write_inverse(factor, upper)
+        upper *= noise_variance
         replaced(covariance)
     return finite
 
 
 @compiled
 def take_step(
-    plant: Plant,
-    network: Network,
-    theta: Vector,
-    prior: Vector,
-    ridge: float,
-    features: Matrix,
-    targets: Matrix,
-    factor: Matrix,
-    damped: bool,
+    trial: Trial, ridge: float, features: Matrix, targets: Matrix, factor: Matrix, damped: bool
 ) -> bool:
     """Take a shortened Gauss-Newton step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖².
 
@@ -357,9 +317,10 @@ def take_step(
     before the step is written, (q, q). False, and no step, where rounding has left it indefinite.
     Where the sum grows at all shares of the step, θ stays, or a damped step is taken.
     """
+    plant, network, theta, prior = trial.plant, trial.network, trial.state.theta, trial.state.prior
     q = theta.shape[0]
     slope, before = np.empty(q), theta.copy()
-    squares = _write_normal(plant, network, theta, features, targets, factor, slope)
+    squares = write_normal(plant, network, theta, features, targets, factor, slope)
     squares += ridge * squared_distance(theta, prior)
     for i in range(q):
         factor[i, i] += ridge
@@ -373,7 +334,7 @@ def take_step(
     while share >= SMALLEST_SHARE:
         for i in range(q):
             theta[i] = before[i] + share * step[i]
-        after = _squared_error(plant, network, theta, features, targets)
+        after = sum_of_squares(plant, network, theta, features, targets)
         if after + ridge * squared_distance(theta, prior) <= squares * NO_GROWTH:
             return True
         share *= 0.5
@@ -385,38 +346,11 @@ def take_step(
         if factorize(short):
             solve(short, step)
             theta[:] = before + step
-            after = _squared_error(plant, network, theta, features, targets)
+            after = sum_of_squares(plant, network, theta, features, targets)
             if after + ridge * squared_distance(theta, prior) < squares:
                 return True
     theta[:] = before
     return True
-
-
-@compiled
-def _write_normal(
-    plant: Plant,
-    network: Network,
-    theta: Vector,
-    features: Matrix,
-    targets: Matrix,
-    normal: Matrix,
-    slope: Vector,
-) -> float:
-    """Write JᵀJ, (q, q), and Jᵀe, (q,), of a model of any kind; return ‖e‖²."""
-    if network.kind == ModelKind.MLP:
-        return normal_equations(network, theta, features, targets, normal, slope)
-    write_normal_equations(plant, network, theta, features, targets, normal, slope)
-    return squared_error(plant, network, theta, features, targets)
-
-
-@compiled
-def _squared_error(
-    plant: Plant, network: Network, theta: Vector, features: Matrix, targets: Matrix
-) -> float:
-    """Return ‖e‖² of a model of any kind."""
-    if network.kind == ModelKind.MLP:
-        return errors_of(network, theta, features, targets)[0]
-    return squared_error(plant, network, theta, features, targets)
 
 
 @compiled
@@ -426,14 +360,6 @@ def squared_distance(a: Vector, b: Vector) -> float:
     for i in range(a.shape[0]):
         total += squared(a[i] - b[i])
     return total
-
-
-@compiled
-def _scale(upper: Matrix, factor: float) -> None:
-    """Multiply the upper triangle of a matrix, (q, q)."""
-    for i in range(upper.shape[0]):
-        for j in range(i, upper.shape[0]):
-            upper[i, j] *= factor
 
 
 FIRST_DAMPING = 1e-3

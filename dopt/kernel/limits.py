@@ -57,13 +57,10 @@ def keep_within_bounds(trial: Trial, t: int, x: Vector, before: Vector, u: Vecto
     backups = backup_inputs(trial.plant.gamma, u.shape[0])
     estimated = has_sensors(trial.sensors)
     errors = estimate_bounds(trial, t, x) if estimated else error_bounds(trial, x)
-    tried, best = np.empty(u.shape[0]), np.inf
-    chosen = u.copy()
-    for i in range(2 + backups.shape[0]):
-        if i < 2:
-            tried[:] = u if i == 0 else -u
-        else:
-            tried[:] = backups[i - 2]
+    others = np.concatenate((u.reshape(1, -1), -u.reshape(1, -1), backups))
+    chosen, best = u.copy(), np.inf
+    for i in range(others.shape[0]):
+        tried = others[i]
         move_within(limits, before, tried)
         excess = largest_excess(trial, x, tried, backups, errors, best)
         if excess < best * (1.0 - TIE_MARGIN):

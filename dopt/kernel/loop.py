@@ -1,10 +1,10 @@
 """Algorithm 1 in compiled code: plan, act, observe, learn, update M, evaluate.
 
-An exploration of a plant (:class:`dopt.explorer.Explorer`) consists of :func:`plan_input` and
-:func:`take_in`; a trial puts between them the simulated system, or a black box that the interpreter
-steps (:mod:`dopt.kernel.run`). Where a policy or a learner is written in numpy, the interpreter
-calls it between compiled steps, and the model answers its questions with the parameters of the
-moment (of an ensemble: of its first member).
+An exploration of a plant (:class:`dopt.explorer.Explorer`) consists of :func:`plan_next` and
+:func:`take_in_next`; a trial puts between them the simulated system, or a black box that the
+interpreter steps (:mod:`dopt.kernel.run`). Where a policy or a learner is written in numpy, the
+interpreter calls it between compiled steps, and the model answers its questions with the parameters
+of the moment (of an ensemble: of its first member).
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from dopt.kernel.model import (
     model_accelerations,
     rows_at,
     within,
-    write_model_gradients,
-    write_network_gradients,
+    write_gradients,
 )
 from dopt.kernel.sensors import has_sensors, measure, output_error
 from dopt.kernel.structs import Evaluation, Learn, Plant, State, Steps, Trial
@@ -36,23 +35,11 @@ from dopt.types import Matrix, Stack, Vector
 
 
 @compiled
-def plan_in_numpy(trial: Trial, t: int, u: Vector) -> None:
-    """Leave u_t as a plan in numpy has chosen it."""
+def do_nothing(trial: Trial, t: int, row: Vector) -> None:
+    """Leave u_t as it was chosen, in numpy too, or parameters as an update in numpy returned them.
 
-
-@compiled
-def learn_in_numpy(trial: Trial, t: int, target: Vector) -> None:
-    """Leave the parameters as an update in numpy has returned them."""
-
-
-@compiled
-def keep_input(trial: Trial, t: int, u: Vector) -> None:
-    """Leave u_t as the policy chose it."""
-
-
-@compiled
-def note_nothing(trial: Trial, t: int, target: Vector) -> None:
-    """Remember nothing of the model's errors."""
+    Where no limits are enforced, nothing of the model's errors is remembered.
+    """
 
 
 @compiled
@@ -89,13 +76,14 @@ def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
         copy_into(state.theta, members[0])
 
 
-@compiled
-def plan_input(trial: Trial, steps: Steps, t: int) -> None:
+@called_from_python
+def plan_next(held: HeldTrial, t: int) -> None:
     """Write u_t, the first of which was drawn before the trial, and the time that it took.
 
     It is what the policy chooses, unless the limits of the trial demand another one, cut to what
     the plant can apply.
     """
+    trial, steps = trial_in(held), held.steps
     start, u = monotonic_microseconds(), trial.record.inputs[t]
     if t > 0:
         steps.plan(trial, t, u)
@@ -117,12 +105,13 @@ def act(plant: Plant, x: Vector, u: Vector, noise: Vector, t: int, following: Ve
         following[i] += noise[i]
 
 
-@compiled
-def act_and_measure(trial: Trial, t: int) -> bool:
+@called_from_python
+def act_next(held: HeldTrial, t: int) -> bool:
     """Write x_{t+1} of the simulated system and what is measured of it.
 
     Returns whether it is within the limit of the states.
     """
+    trial = trial_in(held)
     plant, record = trial.plant, trial.record
     following = record.true_states[t + 1]
     noise = trial.randomness.noise[t]
@@ -144,15 +133,16 @@ def observe(trial: Trial, steps: Steps, t: int, dt: float, target: Vector) -> No
     steps.note_error(trial, t, target)
 
 
-@compiled
-def learn_and_inform(trial: Trial, steps: Steps, t: int, target: Vector) -> bool:
+@called_from_python
+def learn_next(held: HeldTrial, t: int, target: Vector) -> bool:
     """Learn the accelerations observed in step t, (r,), and add the rows at (x_t, u_t) to M.
 
     Returns whether the parameters are finite: otherwise nothing is added.
     """
+    trial = trial_in(held)
     plant, state, record = trial.plant, trial.state, trial.record
     clock_0 = monotonic_microseconds()
-    learn_members(trial, steps.learn, t, target)
+    learn_members(trial, held.steps.learn, t, target)
     clock_1 = monotonic_microseconds()
     if not within(state.theta, np.inf):
         return False
@@ -160,14 +150,6 @@ def learn_and_inform(trial: Trial, steps: Steps, t: int, target: Vector) -> bool
     record.learn_us[t] = clock_1 - clock_0
     record.plan_us[t] += monotonic_microseconds() - clock_1
     return True
-
-
-@compiled
-def take_in(trial: Trial, steps: Steps, t: int, dt: float) -> bool:
-    """Learn from x_t, u_t and x_{t+1}, dt seconds later, and return whether θ is finite."""
-    target = np.empty(trial.plant.learned_rows.shape[0])
-    observe(trial, steps, t, dt, target)
-    return learn_and_inform(trial, steps, t, target)
 
 
 @compiled
@@ -194,29 +176,6 @@ def prediction_error(trial: Trial, steps: Steps, t: int, dt: float) -> float:
 
 
 @called_from_python
-def plan_next(held: HeldTrial, t: int) -> None:
-    """Write u_t (:func:`plan_input`)."""
-    plan_input(trial_in(held), held.steps, t)
-
-
-@called_from_python
-def take_in_next(held: HeldTrial, t: int, dt: float) -> bool:
-    """Learn from the step from x_t to x_{t+1} (:func:`take_in`).
-
-    The loss of the step is the error of the accelerations before they are learned.
-    """
-    trial, steps = trial_in(held), held.steps
-    trial.record.loss[t] = prediction_error(trial, steps, t, dt)
-    return take_in(trial, steps, t, dt)
-
-
-@called_from_python
-def act_next(held: HeldTrial, t: int) -> bool:
-    """Let the simulated system take step t (:func:`act_and_measure`)."""
-    return act_and_measure(trial_in(held), t)
-
-
-@called_from_python
 def observe_next(held: HeldTrial, t: int, dt: float, target: Vector) -> None:
     """Write the accelerations observed in step t (:func:`observe`), and their error as its loss."""
     trial, steps = trial_in(held), held.steps
@@ -225,9 +184,14 @@ def observe_next(held: HeldTrial, t: int, dt: float, target: Vector) -> None:
 
 
 @called_from_python
-def learn_next(held: HeldTrial, t: int, target: Vector) -> bool:
-    """Learn the accelerations observed in step t (:func:`learn_and_inform`)."""
-    return learn_and_inform(trial_in(held), held.steps, t, target)
+def take_in_next(held: HeldTrial, t: int, dt: float) -> bool:
+    """Learn from x_t, u_t and x_{t+1}, dt seconds later, and return whether θ is finite.
+
+    The loss of the step is the error of the accelerations before they are learned.
+    """
+    target = np.empty(trial_in(held).plant.learned_rows.shape[0])
+    observe_next(held, t, dt, target)
+    return learn_next(held, t, target)
 
 
 @compiled
@@ -268,11 +232,13 @@ def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
     trial, steps = trial_in(held), held.steps
     plant, thetas = trial.plant, members_or_one(trial.state)
     buffers = evaluation_buffers(trial.network, thetas, plant.learned_rows.shape[0])
+    target = np.empty(plant.learned_rows.shape[0])
     for t in range(first, last):
-        plan_input(trial, steps, t)
-        if not act_and_measure(trial, t):
+        plan_next(held, t)
+        if not act_next(held, t):
             return t
-        if not take_in(trial, steps, t, plant.dt):
+        observe(trial, steps, t, plant.dt, target)
+        if not learn_next(held, t, target):
             return t
         if not evaluate(trial, points, t, thetas, buffers):
             return t
@@ -303,10 +269,7 @@ def write_jacobian_change(held: HeldTrial, point: Vector, directions: Matrix, ou
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     rows = np.empty((1 + directions.shape[0], theta.shape[0]))
     for i in range(out.shape[1]):
-        if network.kind == ModelKind.MLP:
-            write_network_gradients(network, theta, point, directions, i, rows)
-        else:
-            write_model_gradients(plant, network, theta, point, directions, i, rows)
+        write_gradients(plant, network, theta, point, directions, i, rows)
         for j in range(directions.shape[0]):
             copy_into(rows[1 + j], out[j, i])
 

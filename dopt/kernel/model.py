@@ -39,17 +39,9 @@ from dopt.types import Integers, Matrix, Stack, Vector
 
 
 @compiled
-def n_functions(network: Network) -> int:
-    """Return D."""
-    linear = network.kind == ModelKind.LINEAR_STATE
-    count: int = network.sizes[0] if linear else network.waves.phases.shape[0]
-    return count
-
-
-@compiled
 def write_feature_rows(network: Network, x: Vector, rows: Matrix) -> None:
     """Write J, (r, r D), at a state."""
-    phi, D = np.empty(network.sizes[0]), n_functions(network)
+    phi, D = np.empty(network.sizes[0]), rows.shape[1] // rows.shape[0]
     features_at(network, x, phi)
     rows[:] = 0.0
     for i in range(D):
@@ -70,15 +62,15 @@ def write_feature_row_along(
     features_at(network, x, phi)
     features_along(network, x, direction, phi_dot)
     out[:] = 0.0
-    first = component * n_functions(network)
+    p, D = phi.shape[0], network.waves.phases.shape[0]
     if network.kind == ModelKind.LINEAR_STATE:
-        copy_into(phi_dot, out[first : first + phi_dot.shape[0]])
+        copy_into(phi_dot, out[component * p : (component + 1) * p])
         return
-    for i in range(network.waves.phases.shape[0]):
+    for i in range(D):
         slope = 0.0
         for j in range(phi_dot.shape[0]):
             slope += network.waves.frequencies[i, j] * phi_dot[j]
-        out[first + i] = -network.waves.scale * math.sin(_angle(network, phi, i)) * slope
+        out[component * D + i] = -network.waves.scale * math.sin(_angle(network, phi, i)) * slope
 
 
 @compiled
@@ -374,59 +366,20 @@ def model_accelerations(
 
 
 @compiled
-def write_point_features(
-    network: Network, states: Matrix, inputs: Matrix, features: Matrix
-) -> None:
-    """Write the features of states, (N, d), with inputs, (N, m), one point to a column, (p, N)."""
-    d = states.shape[1]
-    for j in range(features.shape[0]):
-        index = network.feature_indices[j]
-        values = states[:, index] if index < d else inputs[:, index - d]
-        nn.write_feature(network, j, values, features[j])
-
-
-@compiled
-def write_features(network: Network, points: Matrix, features: Matrix) -> None:
-    """Write the features of points, (N, ·), one point to a column, (p, N)."""
-    for j in range(features.shape[0]):
-        nn.write_feature(network, j, points[:, network.feature_indices[j]], features[j])
-
-
-@compiled
 def accelerations_at(
     plant: Plant, network: Network, theta: Vector, states: Matrix, outputs: Matrix
 ) -> None:
     """Write a_θ, (r, N), at points, (N, ·)."""
-    N, r = states.shape[0], outputs.shape[0]
-    if network.kind == ModelKind.GREY_BOX:
-        write_values(plant, network, theta, states.T, outputs)
-        return
-    if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        gaussian_process.write_means(network, theta, states, outputs)
-        return
+    N, value = states.shape[0], np.empty(outputs.shape[0])
     if network.kind != ModelKind.MLP:
-        rows, value = np.empty((r, theta.shape[0])), np.empty(r)
         for n in range(N):
-            regressors(plant, network, states[n], rows, value)
-            add_linear(rows, theta, value)
+            model_accelerations(plant, network, theta, states[n], value)
             outputs[:, n] = value
         return
     features = np.empty((network.feature_kinds.shape[0], N))
     hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * N))
-    write_features(network, states, features)
+    nn.write_features(network, states, features)
     nn.forward(network, theta, features, hidden, outputs)
-
-
-@compiled
-def euler_step(
-    plant: Plant, x: Vector, u: Vector, accelerations: Vector, flow: Vector, following: Vector
-) -> None:
-    """Write x + dt f(x, u), (d,), given the accelerations, (r,)."""
-    plant.known(x, u, plant.parameters, flow)
-    for k in range(accelerations.shape[0]):
-        flow[plant.learned_rows[k]] += accelerations[k]
-    for j in range(x.shape[0]):
-        following[j] = x[j] + plant.dt * flow[j]
 
 
 @compiled
@@ -455,16 +408,8 @@ def linearization_at(
         phi_dot, hidden_dot = point.phi_dots[j], point.hidden_dots[j]
         nn.features_along(network, x, directions[j], phi_dot)
         nn.activations_along(network, theta, phi_dot, point.hidden, hidden_dot)
-        nn.output_signal_along(
-            network,
-            theta,
-            point.phi,
-            phi_dot,
-            point.hidden,
-            hidden_dot,
-            component,
-            signals[1 + j, depth - 1],
-        )
+        states = point.phi, phi_dot, point.hidden, hidden_dot
+        nn.output_signal_along(network, theta, *states, component, signals[1 + j, depth - 1])
     nn.signals_below(network, theta, point.hidden, point.hidden_dots, signals)
     return point
 
@@ -495,15 +440,23 @@ def write_jacobian(network: Network, theta: Vector, x: Vector, rows: Matrix, val
 
 
 @compiled
+def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
+    """Return J, (r, q), at a point, and write a_θ, (r,), there."""
+    rows = np.empty((value.shape[0], theta.shape[0]))
+    if network.kind == ModelKind.MLP:
+        write_jacobian(network, theta, x, rows, value)
+    else:
+        parameter_rows(plant, network, theta, x, rows, value)
+    return rows
+
+
+@compiled
 def rows_at(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Matrix:
     """Return the rows of J at points, (n, ·), as a matrix, (n r, q)."""
     n, r = states.shape[0], plant.learned_rows.shape[0]
     rows, value = np.empty((n * r, theta.shape[0])), np.empty(r)
     for i in range(n):
-        if network.kind != ModelKind.MLP:
-            parameter_rows(plant, network, theta, states[i], rows[r * i : r * (i + 1)], value)
-        else:
-            write_jacobian(network, theta, states[i], rows[r * i : r * (i + 1)], value)
+        rows[r * i : r * (i + 1)] = model_rows(plant, network, theta, states[i], value)
     return rows
 
 
@@ -530,7 +483,7 @@ def write_network_gradients(
 
 
 @compiled
-def write_model_gradients(
+def write_gradients(
     plant: Plant,
     network: Network,
     theta: Vector,
@@ -539,7 +492,10 @@ def write_model_gradients(
     component: int,
     out: Matrix,
 ) -> None:
-    """Do what :func:`write_network_gradients` does for any model but a network."""
+    """Do what :func:`write_network_gradients` does for a model of any kind."""
+    if network.kind == ModelKind.MLP:
+        write_network_gradients(network, theta, x, directions, component, out)
+        return
     r, q = plant.learned_rows.shape[0], theta.shape[0]
     rows = np.empty((r, q))
     parameter_rows(plant, network, theta, x, rows, np.empty(r))

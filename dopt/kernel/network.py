@@ -187,26 +187,28 @@ def output_inputs_along(
 def features_at(network: Network, x: Vector, out: Vector) -> None:
     """Write the features of a point."""
     for i in range(out.shape[0]):
-        value = x[network.feature_indices[i]]
-        kind = network.feature_kinds[i]
-        if kind == FeatureKind.COS:
-            value = math.cos(value)
-        elif kind == FeatureKind.SIN:
-            value = math.sin(value)
-        out[i] = value / network.feature_scales[i]
+        out[i] = _feature(network, i, x[network.feature_indices[i]])
 
 
 @compiled
-def write_feature(network: Network, index: int, values: Vector, out: Vector) -> None:
-    """Write one feature of points, (N,), given the component that it is made of, (N,)."""
-    kind, scale = network.feature_kinds[index], network.feature_scales[index]
-    for n in range(values.shape[0]):
-        value = values[n]
-        if kind == FeatureKind.COS:
-            value = math.cos(value)
-        elif kind == FeatureKind.SIN:
-            value = math.sin(value)
-        out[n] = value / scale
+def write_features(network: Network, points: Matrix, features: Matrix) -> None:
+    """Write the features of points, (N, ·), one point to a column, (p, N)."""
+    for j in range(features.shape[0]):
+        index, row = network.feature_indices[j], features[j]
+        for n in range(points.shape[0]):
+            row[n] = _feature(network, j, points[n, index])
+
+
+@compiled
+def _feature(network: Network, i: int, value: float) -> float:
+    """Return feature i, given the component of the point that it is made of."""
+    kind = network.feature_kinds[i]
+    if kind == FeatureKind.COS:
+        value = math.cos(value)
+    elif kind == FeatureKind.SIN:
+        value = math.sin(value)
+    scaled: float = value / network.feature_scales[i]
+    return scaled
 
 
 @compiled
@@ -276,9 +278,7 @@ def mean_forward(
 def through_tanh(delta: Matrix, activations: Matrix) -> None:
     """Multiply δ, (w, n), by the derivative of tanh, given the activations, (w, n)."""
     for i in range(delta.shape[0]):
-        row, h = delta[i], activations[i]
-        for n in range(row.shape[0]):
-            row[n] *= 1.0 - h[n] * h[n]
+        _through_tanh(delta[i], activations[i])
 
 
 @compiled

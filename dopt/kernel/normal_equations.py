@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dopt.algorithm import ModelKind
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, squared
+from dopt.kernel.model import squared_error, write_normal_equations
 from dopt.kernel.network import batch_back_signals, output_inputs
-from dopt.kernel.structs import Network
+from dopt.kernel.structs import Network, Plant
 from dopt.kernel.vectors import inner_products
 from dopt.types import Matrix, Stack, Vector
 
@@ -33,27 +35,8 @@ def normal_equations(
     """
     total, errors, hidden = errors_of(network, theta, inputs, targets)
     signals = batch_back_signals(network, theta, inputs, hidden, targets.shape[0])
-    below = _completed(network, inputs, hidden)
+    below, depth = _completed(network, inputs, hidden), network.offsets.shape[0] - 1
     _write_slope(network, below, signals, errors, slope)
-    _write_normal(network, below, signals, normal)
-    return total
-
-
-@compiled
-def normal_matrix(network: Network, theta: Vector, inputs: Matrix, r: int, normal: Matrix) -> None:
-    """Write JᵀJ, (q, q), of r outputs over all samples, whose features are ``inputs`` (p, N)."""
-    n = inputs.shape[1]
-    hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * n))
-    outputs = np.empty((r, n))
-    nn.forward(network, theta, inputs, hidden, outputs)
-    signals = batch_back_signals(network, theta, inputs, hidden, r)
-    _write_normal(network, _completed(network, inputs, hidden), signals, normal)
-
-
-@compiled
-def _write_normal(network: Network, below: Stack, signals: Stack, normal: Matrix) -> None:
-    """Write JᵀJ, (q, q), given the activations and δ of all samples."""
-    depth = network.offsets.shape[0] - 1
     for a in range(depth):
         for b in range(a, depth):
             _hidden_block(network, below, signals, a, b, normal)
@@ -61,6 +44,34 @@ def _write_normal(network: Network, below: Stack, signals: Stack, normal: Matrix
     for i in range(normal.shape[0]):
         for j in range(i):
             normal[i, j] = normal[j, i]
+    return total
+
+
+@compiled
+def write_normal(
+    plant: Plant,
+    network: Network,
+    theta: Vector,
+    features: Matrix,
+    targets: Matrix,
+    normal: Matrix,
+    slope: Vector,
+) -> float:
+    """Write JᵀJ, (q, q), and Jᵀe, (q,), of a model of any kind; return ‖e‖²."""
+    if network.kind == ModelKind.MLP:
+        return normal_equations(network, theta, features, targets, normal, slope)
+    write_normal_equations(plant, network, theta, features, targets, normal, slope)
+    return squared_error(plant, network, theta, features, targets)
+
+
+@compiled
+def sum_of_squares(
+    plant: Plant, network: Network, theta: Vector, features: Matrix, targets: Matrix
+) -> float:
+    """Return ‖e‖² of a model of any kind."""
+    if network.kind == ModelKind.MLP:
+        return errors_of(network, theta, features, targets)[0]
+    return squared_error(plant, network, theta, features, targets)
 
 
 @compiled

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, cast
 
 import numba
@@ -19,13 +19,10 @@ from numba.core.errors import NumbaError
 from dopt.algorithm import Integrator
 from dopt.errors import SpecificationError
 from dopt.kernel import integration, limits, loop, sensors
-from dopt.kernel.cache import (
-    compile_missing,
-    one_compiler_at_a_time,
-)
+from dopt.kernel.cache import compile_missing, one_compiler_at_a_time
 from dopt.kernel.compiler import compiled_own
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
-from dopt.kernel.held import FIELDS, HeldTrial, HeldTrialType, hold, pointer_to
+from dopt.kernel.held import FIELDS, HeldTrialType, hold, pointer_to
 from dopt.kernel.plain import PLAIN
 from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Steps, Trial
 from dopt.learning.base import CompiledLearner, Learner
@@ -43,54 +40,41 @@ def layout_of(value: object) -> Hashable:
 
 
 class Compiled(NamedTuple):
-    """Compiled code of a trial."""
+    """Compiled code of a trial: what its steps call, and what calls them."""
 
-    hold: Callable[..., HeldTrial]
-    advance: Callable[..., int]
     steps: Steps
+    callers: list[Callable[..., Any]]
 
 
-class CompiledSteps(NamedTuple):
-    """Compiled code of a trial whose steps are taken one by one."""
+def compiled_trial(
+    policy: Policy,
+    learner: Learner,
+    trial: Trial,
+    callers: tuple[CompiledFunction, ...],
+    points: Evaluation | None = None,
+    others: tuple[CompiledFunction, ...] = (),
+) -> Compiled:
+    """Compile ``callers`` for a trial, with the functions of its policy and its learner.
 
-    hold: Callable[..., HeldTrial]
-    plan_input: Callable[..., int]
-    take_in: Callable[..., int]
-    steps: Steps
-
-
-def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
-    """Compile the loop for a trial, with the functions of its policy and its learner."""
+    What is missing in the cache of ``others`` is compiled beside them.
+    """
     kinds = layout_of((trial, points, *_others(trial).values()))
-    key = (kinds, _source(policy), _source(learner))
+    key = (kinds, callers, others, _source(policy), _source(learner))
     if key not in _trials:
-        steps = _compiled_parts(policy, learner, trial, [hold, loop.advance])
-        _trials[key] = Compiled(compiled_step(trial, hold), compiled_loop(trial, points), steps)
+        steps = _compiled_parts(policy, learner, trial, [*callers, *others])
+        _trials[key] = Compiled(steps, [compiled_step(trial, one, points) for one in callers])
     return _trials[key]
 
 
 _trials: dict[Hashable, Compiled] = {}
-
-
-def compiled_steps(
-    policy: Policy, learner: Learner, trial: Trial, others: Sequence[CompiledFunction]
-) -> CompiledSteps:
-    """Compile the steps of a trial, with the functions of its policy and its learner.
-
-    What is missing in the cache of others is compiled beside them.
-    """
-    steps = _compiled_parts(policy, learner, trial, [*STEPS, *others])
-    hold, plan_input, take_in = (compiled_step(trial, step) for step in STEPS)
-    return CompiledSteps(hold, plan_input, take_in, steps)
-
 
 STEPS = (hold, loop.plan_next, loop.take_in_next)
 """Functions of steps one by one, which do not depend on the policy and the learner."""
 
 
 OTHER_STEPS = {
-    "limit_input": (loop.keep_input, limits.limit_input),
-    "note_error": (loop.note_nothing, limits.note_error),
+    "limit_input": (loop.do_nothing, limits.limit_input),
+    "note_error": (loop.do_nothing, limits.note_error),
     "estimate_state": (loop.keep_state, sensors.estimate_state),
     "observe": (integration.observe_euler, integration.observe_runge_kutta),
 }
@@ -120,7 +104,7 @@ def _compiled_parts(
     for name, function in trial.information._asdict().items():
         compile_form(trial, name, function)
     for name, function in others.items():
-        compiled_at(path_of(function), getattr(kinds, name))
+        compiled_for(function, getattr(kinds, name).args)
     plan, learn = function_of(policy, kinds.plan), function_of(learner, kinds.learn)
     return Steps(plan, learn, **others)
 
@@ -142,7 +126,7 @@ def _source(part: Policy | Learner) -> str | Callable[..., None]:
 def compile_form(trial: Trial, name: str, function: CompiledFunction) -> None:
     """Compile a function of a form of M; ``name`` is its field in :class:`Information`."""
     kinds = _information_signatures(trial.plant, trial.network, trial.state)
-    compiled_for(path_of(function), function, kinds[name].args)
+    compiled_for(function, kinds[name].args)
 
 
 def path_of(function: CompiledFunction) -> str:
@@ -173,30 +157,19 @@ def step_kinds(trial: Trial) -> Steps:
     )
 
 
-def compiled_loop(trial: Trial, points: Evaluation) -> Callable[..., int]:
-    """Compile the loop for a trial."""
-    kinds = (held_kind(trial), kind_of(points), int64, int64)
-    return compiled_for(path_of(loop.advance), loop.advance, kinds)
-
-
-def compiled_evaluation(trial: Trial, points: Evaluation) -> Callable[..., bool]:
-    """Compile the evaluation of a trial whose steps are taken one by one."""
-    kinds = (held_kind(trial), kind_of(points), int64)
-    return compiled_for(path_of(loop.evaluate_next), loop.evaluate_next, kinds)
-
-
-def compiled_step(trial: Trial, step: CompiledFunction) -> Callable[..., Any]:
-    """Compile one of :data:`STEPS` or :data:`BETWEEN`."""
+def compiled_step(
+    trial: Trial, step: CompiledFunction, points: Evaluation | None = None
+) -> Callable[..., Any]:
+    """Compile one of :data:`STEPS` or :data:`BETWEEN`, the loop, or an evaluation at points."""
     held = held_kind(trial)
-    given = tuple(held.field_dict.values())
-    kinds = given if step is hold else (held, *_FURTHER_ARGUMENTS[step])
-    return compiled_for(path_of(step), step, kinds)
+    if step is hold:
+        return compiled_for(step, tuple(held.field_dict.values()))
+    first = (kind_of(points),) if step in (loop.advance, loop.evaluate_next) else ()
+    return compiled_for(step, (held, *first, *_FURTHER_ARGUMENTS[step]))
 
 
 _ROW, _MATRIX, _STACK = float64[::1], float64[:, ::1], float64[:, :, ::1]
-_FURTHER_ARGUMENTS: dict[CompiledFunction, tuple[NumbaType, ...]] = {
-    loop.plan_next: (int64,),
-    loop.take_in_next: (int64, float64),
+_ARGUMENTS_BETWEEN: dict[CompiledFunction, tuple[NumbaType, ...]] = {
     loop.act_next: (int64,),
     loop.observe_next: (int64, float64, _ROW),
     loop.learn_next: (int64, _ROW),
@@ -205,16 +178,22 @@ _FURTHER_ARGUMENTS: dict[CompiledFunction, tuple[NumbaType, ...]] = {
     loop.write_jacobian_change: (_ROW, _MATRIX, _STACK),
     loop.write_following: (_ROW, _MATRIX, _MATRIX),
     loop.write_input_matrix: (_ROW, _MATRIX),
+}
+_FURTHER_ARGUMENTS = _ARGUMENTS_BETWEEN | {
+    loop.plan_next: (int64,),
+    loop.take_in_next: (int64, float64),
     loop.write_reached: (_ROW, _MATRIX, _ROW, _ROW),
+    loop.advance: (int64, int64),
+    loop.evaluate_next: (int64,),
 }
 
-BETWEEN = tuple(step for step in _FURTHER_ARGUMENTS if step not in (*STEPS, loop.write_reached))
+BETWEEN = tuple(_ARGUMENTS_BETWEEN)
 """Functions that the interpreter calls where a plan or an update is written in numpy."""
 
 
 def held_kind(trial: Trial) -> NumbaType:
     """Return the type of a trial that is held with pointers to its policy and learner."""
-    steps = types.NamedTuple([*map(pointer, step_kinds(trial))], Steps)
+    steps = types.NamedTuple([*map(types.FunctionType, step_kinds(trial))], Steps)
     whole = (kind_of(trial), steps)
     return HeldTrialType(list(zip(FIELDS, whole, strict=True)))
 
@@ -243,7 +222,7 @@ def compiled_at(path: str, signature: NumbaType) -> CompiledFunction:
     """Compile the function of the package at a dotted path."""
     module, _, name = path.rpartition(".")
     function = getattr(importlib.import_module(module), name)
-    compiled_for(path, function, signature.args)
+    compiled_for(function, signature.args)
     return function
 
 
@@ -280,33 +259,25 @@ _kinds: dict[Hashable, NumbaType] = {}
 def _kind_of_fields(value: tuple[object, ...]) -> NumbaType:
     if isinstance(value, Plant):
         equations = (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)
-        kinds = [*map(pointer, equations), *map(kind_of, value[len(equations) :])]
+        kinds = [*map(types.FunctionType, equations), *map(kind_of, value[len(equations) :])]
     elif isinstance(value, Trial):
         functions = _information_signatures(value.plant, value.network, value.state)
-        information = types.NamedTuple([*map(pointer, functions.values())], Information)
+        information = types.NamedTuple([*map(types.FunctionType, functions.values())], Information)
         kinds = [information if isinstance(part, Information) else kind_of(part) for part in value]
     else:
         kinds = [*map(kind_of, value)]
     return types.NamedTuple(kinds, type(value))
 
 
-def pointer(signature: NumbaType) -> NumbaType:
-    """Return the type of a pointer to functions of a signature."""
-    return types.FunctionType(signature)
-
-
-def compiled_for(
-    name: str, function: CompiledFunction, kinds: tuple[NumbaType, ...]
-) -> Callable[..., Any]:
+def compiled_for(function: CompiledFunction, kinds: tuple[NumbaType, ...]) -> Callable[..., Any]:
     """Return the machine code of a function for types of arguments; compiling it on first use."""
     if PLAIN:
         return cast(Callable[..., Any], function)
-    if (name, kinds) not in _done:
-        with one_compiler_at_a_time(
-            f"{name}-{hashlib.sha256(str(kinds).encode()).hexdigest()[:16]}"
-        ):
-            _done[name, kinds] = function.compile(kinds)
-    return _done[name, kinds]
+    if (function, kinds) not in _done:
+        digest = hashlib.sha256(str(kinds).encode()).hexdigest()[:16]
+        with one_compiler_at_a_time(f"{path_of(function)}-{digest}"):
+            _done[function, kinds] = function.compile(kinds)
+    return _done[function, kinds]
 
 
-_done: dict[tuple[str, tuple[NumbaType, ...]], Callable[..., Any]] = {}
+_done: dict[tuple[CompiledFunction, tuple[NumbaType, ...]], Callable[..., Any]] = {}

@@ -14,16 +14,11 @@ import numpy as np
 
 from dopt.algorithm import TIE_MARGIN
 from dopt.kernel import gaussian_process as gp
-from dopt.kernel.compiler import compilable, compiled, squared
-from dopt.kernel.integration import (
-    arrival_columns,
-    arrival_state,
-    point_columns,
-    predicted_state,
-)
+from dopt.kernel.compiler import compilable, compiled, copy_into, squared
+from dopt.kernel.integration import arrival_columns, arrival_state, point_columns, predicted_state
 from dopt.kernel.linear_algebra import factorize
 from dopt.kernel.model import model_point
-from dopt.kernel.search import advance_paths, keep_points, paths_from
+from dopt.kernel.search import roll
 from dopt.kernel.structs import Trial
 from dopt.kernel.vectors import inner
 from dopt.sphere import sphere_maximizer
@@ -33,8 +28,7 @@ from dopt.types import Matrix, Vector
 @compiled
 def plan_drawn(trial: Trial, t: int, u: Vector) -> None:
     """Write the input u_t, (m,), as it was drawn."""
-    for j in range(u.shape[0]):
-        u[j] = trial.randomness.inputs[t, j]
+    copy_into(trial.randomness.inputs[t], u)
 
 
 compilable(sphere_maximizer)
@@ -67,9 +61,7 @@ def plan_d_optimal(trial: Trial, t: int, u: Vector) -> None:
         v[i] = -S[0, 1 + i]
         for j in range(m):
             Q[i, j] = S[1 + i, 1 + j]
-    chosen = sphere_maximizer(Q, v, radii[0], tie)
-    for i in range(m):
-        u[i] = chosen[i]
+    copy_into(sphere_maximizer(Q, v, radii[0], tie), u)
 
 
 @compiled
@@ -106,8 +98,7 @@ def plan_uniform(trial: Trial, t: int, u: Vector) -> None:
         value = _distances(center, columns, tried, states, t, gradient)
         if value > best_value * (1.0 + TIE_MARGIN):
             best_value = value
-            for j in range(m):
-                u[j] = tried[j]
+            copy_into(tried, u)
 
 
 @compiled
@@ -142,18 +133,15 @@ def _distances(
 def plan_held_candidates(trial: Trial, t: int, u: Vector) -> None:
     """Write the candidate of the largest entropy, (m,); of equal ones the first."""
     plant, network, search, state = trial.plant, trial.network, trial.algorithm.search, trial.state
-    (C, m), H, d = search.candidates.shape, search.steps, trial.record.states.shape[1]
-    starts, visited = np.empty((C, d)), np.empty((C * H, d))
+    (C, m), H = search.candidates.shape, search.steps
+    starts, held = np.empty((C, trial.record.states.shape[1])), search.candidates.reshape(C, 1, m)
     starts[:] = trial.record.states[t]
-    paths, held = paths_from(plant, network, starts), search.candidates.reshape(C, 1, m)
-    for i in range(H):
-        advance_paths(plant, network, state.theta, paths, held, 0)
-        keep_points(plant, network, paths, i, H, visited)
+    rolled = roll(plant, network, state.theta, starts, held, np.zeros(H, np.int64), 0, 1)
     # Components that share a kernel have the same entropy.
     r = plant.learned_rows.shape[0] if network.process.shared.shape[0] == 0 else 1
     rows = np.empty((C * H * r, network.process.n_samples[0]))
     features = np.empty((C * H * r, network.sizes[0]))
-    gp.write_rows(network, state, r, visited, rows, features)
+    gp.write_rows(network, state, r, rolled.points, rows, features)
     numbers = gp.numbers_by_row(network, state.theta, r)
     best, covariance = -np.inf, np.empty((H * r, H * r))
     u[:] = search.candidates[0]

@@ -10,40 +10,35 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import float64
 
 from dopt.control.planning import Forecast
 from dopt.control.task import Feedback
-from dopt.custom_planner import custom_planner
+from dopt.custom_planner import custom_planner, custom_updater
 from dopt.errors import SpecificationError
 from dopt.kernel import loop
-from dopt.kernel.from_spec import KernelState, network_of, plant_of, points_of_trial, shared_points
-from dopt.kernel.held import HeldPlantType, HeldTrial, hold_plant
-from dopt.kernel.integration import (
-    follow_equations,
-    follow_network,
-)
+from dopt.kernel.evidence import Evidence, is_tuned
+from dopt.kernel.from_spec import network_of, plant_of, points_of_trial, shared_points, trial_of
+from dopt.kernel.held import FIELDS, HeldTrial, HeldTrialType, hold
+from dopt.kernel.integration import follow_equations, follow_network
 from dopt.kernel.linear_algebra import dense
-from dopt.kernel.loop import act_next, evaluate_next, learn_next, observe_next
 from dopt.kernel.pointers import (
     BETWEEN,
-    Compiled,
-    compiled_evaluation,
+    STEPS,
     compiled_for,
     compiled_step,
-    compiled_steps,
     compiled_trial,
     kind_of,
 )
-from dopt.kernel.structs import Trial
-from dopt.learning.base import CustomLearner, Updater, check_update
+from dopt.kernel.structs import Evaluation
+from dopt.learning.base import check_update
 from dopt.models import MLP
 from dopt.models.base import Model
-from dopt.policies.base import CompiledPolicy, Planner, check_choice, check_norms
-from dopt.randomness import episode_seed, stream
+from dopt.policies.base import CompiledPolicy, check_choice, check_norms
+from dopt.randomness import draw, episode_seed
 from dopt.result import TrialResult
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
@@ -62,17 +57,12 @@ class NumpyParts:
         Accelerations observed in each step.
     """
 
-    def __init__(self, spec: TrialSpec, trial: Trial, held: HeldTrial) -> None:
-        self._spec, self._trial, self._held = spec, trial, held
-        self._queries: dict[CompiledFunction, CompiledFunction] = {}
-        policy, learner, system = spec.policy, spec.learner, spec.system
-        self._planner: Planner | None = None
-        self._updater: Updater | None = None
-        if policy.is_in_numpy():
-            self._planner = custom_planner(spec)
-        if learner.is_in_numpy() and isinstance(learner, CustomLearner):
-            self._updater = learner.updater(system, stream(spec.seed, "updater"))
-        self.targets = np.full((system.horizon, system.n_learned), np.nan)
+    def __init__(self, steps: KernelState) -> None:
+        spec = self._spec = steps.spec
+        self._steps = steps
+        self._planner = custom_planner(spec) if spec.policy.is_in_numpy() else None
+        self._updater = custom_updater(spec) if spec.learner.is_in_numpy() else None
+        self.targets = np.full((spec.system.horizon, spec.system.n_learned), np.nan)
 
     @staticmethod
     def needed_by(config: TrialConfig) -> bool:
@@ -111,7 +101,7 @@ class NumpyParts:
         """
         if self._updater is None:
             return 0.0
-        start, theta = time.perf_counter(), self._trial.state.theta
+        start, theta = time.perf_counter(), self._steps.state.theta
         updated = np.asarray(self._updater.update(self._view(t + 1)), dtype=np.float64)
         seconds = time.perf_counter() - start
         check_update(self._spec.learner.name, updated, theta.shape)
@@ -126,27 +116,17 @@ class NumpyParts:
         return 1e6 * (time.perf_counter() - start)
 
     def _view(self, t: int) -> KernelTrialView:
-        return KernelTrialView(self._spec.system, self._trial, self.targets, t, self._ask)
-
-    def _ask(self, query: CompiledFunction, *arrays: Array) -> None:
-        """Call a function of the model, which is compiled when it is first asked."""
-        if query not in self._queries:
-            self._queries[query] = compiled_step(self._trial, query)
-        self._queries[query](self._held, *arrays)
+        return KernelTrialView(self._steps, self.targets, t)
 
 
 class KernelTrialView(TrialView):
-    """A trial of the kernel after t steps; its arrays cannot be written into.
+    """A trial of the kernel after t steps; its arrays cannot be written into."""
 
-    ``ask`` calls a function of :mod:`dopt.kernel.loop` with arrays.
-    """
-
-    def __init__(
-        self, system: System, trial: Trial, targets: Array, t: int, ask: Callable[..., None]
-    ) -> None:
+    def __init__(self, steps: KernelState, targets: Array, t: int) -> None:
+        trial, system = steps.trial, steps.spec.system
         record, state = trial.record, trial.state
         self.system, self.t = system, t
-        self._ask, self._size = ask, len(state.theta)
+        self._call, self._size = steps.call, len(state.theta)
         self._covariance, self._row_scale = state.covariance, trial.algorithm.search.row_scale
         self._point_size = system.n_states + trial.network.n_inputs_read
         self.states, self.inputs = _fixed(record.states[: t + 1]), _fixed(record.inputs[:t])
@@ -166,22 +146,18 @@ class KernelTrialView(TrialView):
 
     def predict(self, states: Array) -> Array:
         points = _given("states", states, None, self._point_size)
-        out = np.empty((len(points), self.system.n_learned))
-        self._ask(loop.write_accelerations, points, out)
-        return out
+        return self._asked(loop.write_accelerations, (len(points), self.system.n_learned), points)
 
     def jacobian(self, state: Array) -> Array:
         point = _given("a state", state, self._point_size)
-        out = np.empty((self.system.n_learned, self._size))
-        self._ask(loop.write_jacobian, point[None], out)
-        return out
+        shape = self.system.n_learned, self._size
+        return self._asked(loop.write_jacobian, shape, point[None])
 
     def jacobian_change(self, state: Array, directions: Array) -> Array:
         point = _given("a state", state, self._point_size)
         along = _given("directions", directions, None, self._point_size)
-        out = np.empty((len(along), self.system.n_learned, self._size))
-        self._ask(loop.write_jacobian_change, point, along, out)
-        return out
+        shape = len(along), self.system.n_learned, self._size
+        return self._asked(loop.write_jacobian_change, shape, point, along)
 
     @property
     def covariance(self) -> Array:
@@ -195,15 +171,18 @@ class KernelTrialView(TrialView):
     def following(self, state: Array, inputs: Array) -> Array:
         x = _given("a state", state, self.system.n_states)
         u = _given("inputs", inputs, None, self.system.n_inputs)
-        out = np.empty((len(u), self.system.n_states))
-        self._ask(loop.write_following, x, u, out)
-        return out
+        return self._asked(loop.write_following, (len(u), self.system.n_states), x, u)
 
     def input_matrix(self, state: Array) -> Array:
         x = _given("a state", state, self.system.n_states)
-        out = np.empty((self.system.n_inputs, self.system.n_states))
-        self._ask(loop.write_input_matrix, x, out)
-        return out.T
+        shape = self.system.n_inputs, self.system.n_states
+        return self._asked(loop.write_input_matrix, shape, x).T
+
+    def _asked(self, query: CompiledFunction, shape: tuple[int, ...], *arrays: Array) -> Array:
+        """Return the array that a function of the model writes, given others."""
+        out = np.empty(shape)
+        self._call(query, *arrays, out)
+        return out
 
 
 def _given(what: str, values: Array, *shape: int | None) -> Array:
@@ -232,28 +211,92 @@ def _fixed(values: Array) -> Array:
     return view
 
 
+class KernelState:
+    """A trial in the compiled kernel: its observations, its learned parameters and its code.
+
+    Attributes
+    ----------
+    trial : Trial
+        Arguments of the compiled functions.
+    state, record : State, Record
+        Its arrays that they write in place.
+    points : Evaluation or None
+        Points at which the model is compared with the truth, where there is one.
+    done : int
+        Number of steps done.
+    diverged_at : int or None
+        Step at which the trial diverged.
+    """
+
+    callers: ClassVar[tuple[CompiledFunction, ...]] = (hold, loop.advance)
+    also_called: ClassVar[tuple[CompiledFunction, ...]] = ()
+    points: Evaluation | None = None
+    done: int = 0
+    diverged_at: int | None = None
+
+    def __init__(self, spec: TrialSpec) -> None:
+        draws = draw(spec)
+        self.spec, self.trial = spec, trial_of(spec, draws)
+        self.state, self.record = self.trial.state, self.trial.record
+        self.evidence = Evidence(spec, self.trial) if is_tuned(spec.model) else None
+        n_fixed = spec.model.n_fixed_parameters(spec.system)
+        self._fixed = draws.weights[len(draws.weights) - n_fixed :]
+        self._code: dict[CompiledFunction, CompiledFunction] = {}
+
+    @functools.cached_property
+    def held(self) -> HeldTrial:
+        """The trial as compiled code holds it."""
+        spec, others = self.spec, self.also_called
+        others = (*others, *BETWEEN) if NumpyParts.needed_by(spec.config) else others
+        parts = spec.policy, spec.learner, self.trial
+        steps, code = compiled_trial(*parts, self.callers, self.points, others)
+        self._code |= zip(self.callers, code, strict=True)
+        held: HeldTrial = self._code[hold](self.trial, steps)
+        return held
+
+    def call(self, function: CompiledFunction, *given: object) -> Any:
+        """Call a function of :mod:`dopt.kernel.loop`, which is compiled when it is first called."""
+        held = self.held
+        if function not in self._code:
+            self._code[function] = compiled_step(self.trial, function, self.points)
+        return self._code[function](held, *given)
+
+    def _check_inputs(self, first: int, last: int) -> None:
+        """Refuse inputs larger than γ from a compiled policy in a user's file."""
+        policy, inputs = self.spec.policy, self.record.inputs[first:last]
+        if isinstance(policy, CompiledPolicy):
+            check_norms(policy.name, inputs, first, self.spec.system.gamma)
+
+    @property
+    def parameters(self) -> Array:
+        """Parameters of the model, (q,), of all members, and those that stay as they were drawn."""
+        if self.state.members.parameters.shape[0] > 0:
+            return self.state.members.parameters.flatten()
+        return np.concatenate([self.state.theta, self._fixed])
+
+    @property
+    def states(self) -> Array:
+        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet.
+
+        Of a simulation they are the true ones.
+        """
+        return self.record.true_states
+
+
 class KernelSteps(KernelState):
     """The compiled steps of a trial: the caller says what state a plant has and what follows.
 
     The states and the inputs of the record are theirs to write.
     """
 
-    also_called: ClassVar[tuple[CompiledFunction, ...]] = ()
+    callers = STEPS
 
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
         if spec.system.n_measured:
             self.trial.sensors.start_variances[:] = start_variances(spec.system)
-        in_numpy = NumpyParts.needed_by(spec.config)
-        others = (*self.also_called, *(BETWEEN if in_numpy else ()))
-        self._code = compiled_steps(spec.policy, spec.learner, self.trial, others)
-        self._held = self._code.hold(self.trial, self._code.steps)
-        self._parts: NumpyParts | None = None
-        self._reached: CompiledFunction | None = None
-        if in_numpy:
-            self._parts = NumpyParts(spec, self.trial, self._held)
-            self._observe = compiled_step(self.trial, observe_next)
-            self._learn = compiled_step(self.trial, learn_next)
+        self._parts = NumpyParts(self) if NumpyParts.needed_by(spec.config) else None
+        _ = self.held  # before the first step, which waits for nothing then
 
     @property
     def states(self) -> Array:
@@ -289,10 +332,8 @@ class KernelSteps(KernelState):
 
     def reached(self, t: int, inputs: Array, seconds: Array) -> Array:
         """Return the state, (d,), predicted from x_t after inputs (n, m) held for times (n,)."""
-        if self._reached is None:
-            self._reached = compiled_step(self.trial, loop.write_reached)
         state: Array = np.empty(self.spec.system.n_states)
-        self._reached(self._held, self.record.states[t], inputs, seconds, state)
+        self.call(loop.write_reached, self.record.states[t], inputs, seconds, state)
         return state
 
     def note_asked(self, u: Array) -> None:
@@ -303,7 +344,7 @@ class KernelSteps(KernelState):
     def plan_input(self, t: int) -> None:
         """Write the input u_t that the policy chooses at x_t."""
         chosen_in = self._parts.choose(t, self.record.inputs[t]) if self._parts else 0.0
-        self._code.plan_input(self._held, t)
+        self.call(loop.plan_next, t)
         self.record.plan_us[t] += chosen_in
 
     def take_in(self, t: int, dt: float) -> bool:
@@ -312,11 +353,11 @@ class KernelSteps(KernelState):
         Returns whether the parameters are finite.
         """
         if self._parts is None:
-            return bool(self._code.take_in(self._held, t, dt))
+            return bool(self.call(loop.take_in_next, t, dt))
         target = self._parts.targets[t]
-        self._observe(self._held, t, dt, target)
+        self.call(loop.observe_next, t, dt, target)
         updated_in = self._parts.update(t)
-        finite = bool(self._learn(self._held, t, target))
+        finite = bool(self.call(loop.learn_next, t, target))
         self.record.learn_us[t] += updated_in
         if finite:
             self.record.plan_us[t] += self._parts.note(t)
@@ -331,21 +372,16 @@ def is_stepped(config: TrialConfig) -> bool:
 class SteppedTrial(KernelSteps):
     """A trial in steps, with the attributes of :class:`dopt.kernel.run.KernelTrial`."""
 
-    also_called = (evaluate_next,)
+    points: Evaluation
+    also_called = (loop.evaluate_next,)
 
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
-        shared = shared_points(spec.config)
-        self.points = points_of_trial(shared, self.trial.network)
-        self.done = 0
-        self.diverged_at: int | None = None
-        self._evaluate = compiled_evaluation(self.trial, self.points)
+        self.points = points_of_trial(shared_points(spec.config), self.trial.network)
         self._episode = None
         if isinstance(spec.system, BlackBox):
             self._episode = spec.system.episode(episode_seed(spec.seed))
             self.begin(0, self._episode.state)
-        else:
-            self._act = compiled_step(self.trial, act_next)
 
     @property
     def feedback(self) -> Feedback | None:
@@ -363,10 +399,9 @@ class SteppedTrial(KernelSteps):
     def _step(self, t: int) -> bool:
         """Take step t, and return whether the trial goes on."""
         self.plan_input(t)
-        if isinstance(self.spec.policy, CompiledPolicy):
-            check_norms(self.spec.policy.name, self.inputs[t : t + 1], t, self.spec.system.gamma)
+        self._check_inputs(t, t + 1)
         inside, dt = self._go_on(t), self.spec.system.dt
-        goes_on = inside and self.take_in(t, dt) and self._evaluate(self._held, self.points, t)
+        goes_on = inside and self.take_in(t, dt) and self.call(loop.evaluate_next, self.points, t)
         if goes_on and self.evidence and t + 1 == self.evidence.due:
             self.record.learn_us[t] += self.evidence.fit(self.points)
         return goes_on
@@ -374,7 +409,7 @@ class SteppedTrial(KernelSteps):
     def _go_on(self, t: int) -> bool:
         """Let the system go on to x_{t+1}, and return whether that is within its limit."""
         if self._episode is None:
-            return bool(self._act(self._held, t))
+            return bool(self.call(loop.act_next, t))
         self.inputs[t] = self._episode.step(self.inputs[t].copy())
         if (start := new_start(self._episode)) is not None:
             self.begin(t, start)
@@ -391,36 +426,14 @@ PIECE_SECONDS = 1.0
 
 
 class KernelTrial(KernelState):
-    """A simulated trial, which can be advanced in pieces and looked at in between.
+    """A simulated trial, which can be advanced in pieces and looked at in between."""
 
-    Attributes
-    ----------
-    points : Evaluation
-        Points at which the model is compared with the truth.
-    done : int
-        Number of steps done.
-    diverged_at : int or None
-        Step at which the trial diverged.
-    feedback : Feedback or None
-        The law of feedback that the policy has learned.
-    """
+    points: Evaluation
+    feedback: Feedback | None = None  # no compiled policy learns one
 
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
-        shared = shared_points(spec.config)
-        self.points = points_of_trial(shared, self.trial.network)
-        self.done = 0
-        self.diverged_at: int | None = None
-        self.feedback: Feedback | None = None  # no compiled policy learns one
-
-    @functools.cached_property
-    def _code(self) -> Compiled:
-        return compiled_trial(self.spec.policy, self.spec.learner, self.trial, self.points)
-
-    @functools.cached_property
-    def held(self) -> HeldTrial:
-        """The trial as compiled code holds it."""
-        return self._code.hold(self.trial, self._code.steps)
+        self.points = points_of_trial(shared_points(spec.config), self.trial.network)
 
     def advance(self, last: int) -> None:
         """Run the steps up to ``last``, unless they are done or the trial has diverged.
@@ -440,18 +453,12 @@ class KernelTrial(KernelState):
         before = self.done
         while self.done < last and self.diverged_at is None:
             stop = min(last, self.evidence.due) if self.evidence else last
-            self.done = self._code.advance(self.held, self.points, self.done, stop)
+            self.done = self.call(loop.advance, self.points, self.done, stop)
             if self.done < stop:
                 self.diverged_at = self.done
             elif self.evidence and self.done == self.evidence.due:
                 self.record.learn_us[self.done - 1] += self.evidence.fit(self.points)
-        _check_inputs(self.spec, self.record.inputs, before, self.done)
-
-
-def _check_inputs(spec: TrialSpec, inputs: Array, first: int, last: int) -> None:
-    """Refuse inputs larger than γ from a compiled policy in a user's file."""
-    if isinstance(spec.policy, CompiledPolicy):
-        check_norms(spec.policy.name, inputs[first:last], first, spec.system.gamma)
+        self._check_inputs(before, self.done)
 
 
 def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
@@ -511,24 +518,23 @@ def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
     if isinstance(model, MLP):
         thetas = np.reshape(parameters, (model.n_members, -1)).copy()
         given = (network_of(system, model), thetas)
-        return _forecast("follow-network", follow_network, system, given)
+        return _forecast(follow_network, system, given)
     # The accelerations are affine in θ, so that the linear model is the system with θ for its own.
     offset, *units = np.array(system.linear_form)
     return _by_equations(system, offset + parameters @ (np.array(units) - offset))
 
 
 def _by_equations(system: System, parameters: Array) -> Forecast:
-    return _forecast("follow-equations", follow_equations, system, (np.array(parameters),))
+    return _forecast(follow_equations, system, (np.array(parameters),))
 
 
-def _forecast(
-    name: str, function: Callable[..., None], system: System, given: tuple[object, ...]
-) -> Forecast:
-    plant = plant_of(system)
-    kind = kind_of(plant)
-    held = compiled_for("hold-plant", hold_plant, (kind,))(plant)
-    kinds = (HeldPlantType([("plant", kind)]), *map(kind_of, given), *[float64[:, :, ::1]] * 2)
-    follow = compiled_for(name, function, kinds)
+def _forecast(function: Callable[..., None], system: System, given: tuple[object, ...]) -> Forecast:
+    whole = plant_of(system), 0  # a plant calls nothing
+    kinds = tuple(map(kind_of, whole))
+    held = compiled_for(hold, kinds)(*whole)
+    kind = HeldTrialType(list(zip(FIELDS, kinds, strict=True)))
+    stacks = [float64[:, :, ::1]] * 2
+    follow = compiled_for(function, (kind, *map(kind_of, given), *stacks))
 
     def forecast(states: Array, inputs: Array) -> Array:
         n, steps, _ = inputs.shape

@@ -1,8 +1,7 @@
 """Sampling planners in compiled code (:mod:`dopt.policies.search`): at each step, or in episodes.
 
 Sizes beside :mod:`dopt.kernel.structs`: H steps of a plan, K inputs of it, P plans, n states of its
-path whose rows count, g + s directions. The numbers of the episodic planner end with the steps k
-from one search to the next.
+path whose rows count, g + s directions.
 
 Accelerations at many states are predicted along draws of the parameters, which have the covariance
 M⁻¹ = U Uᵀ with U upper triangular, the inverse of the transposed Cholesky factor of M. For a
@@ -28,10 +27,10 @@ from dopt.kernel.linear_algebra import (
     solve_transposed_columns,
     write_dense,
 )
-from dopt.kernel.model import n_next_points, next_points, parameter_rows, rows_at, write_features
+from dopt.kernel.model import n_next_points, parameter_rows
 from dopt.kernel.network import batch_back_signals, multiply_vector, output_inputs
-from dopt.kernel.search import advance_paths, keep_points, paths_from
-from dopt.kernel.structs import Covariance, Network, Plant, State, Trial
+from dopt.kernel.search import roll, rows_at_states
+from dopt.kernel.structs import Network, Plant, State, Trial
 from dopt.kernel.vectors import (
     add_multiple,
     inner,
@@ -40,7 +39,7 @@ from dopt.kernel.vectors import (
     product,
     subtract_product,
 )
-from dopt.types import Booleans, Integers, Matrix, Stack, Vector
+from dopt.types import Matrix, Stack, Vector
 
 
 class Directions(NamedTuple):
@@ -73,7 +72,8 @@ def directions(state: State, normals: Matrix, chosen: Matrix) -> tuple[bool, Dir
     root = Root(state.factor, state.factor.shape[0] == 0)
     if root.of_inverse:
         root = Root(np.empty((q, q)), True)
-        _write_reversed(state.covariance, root.factor)
+        write_dense(state.covariance, root.factor)
+        root.factor[:] = root.factor[::-1, ::-1].copy()
         if not factorize(root.factor):
             return False, found
     Z, random = np.empty((q, g + s)), normals / np.sqrt(s)
@@ -107,13 +107,6 @@ def _products(root: Root, columns: Matrix) -> Matrix:
 
 
 @compiled
-def _write_reversed(covariance: Covariance, out: Matrix) -> None:
-    """Write M⁻¹ with its rows and columns in reverse order, (q, q)."""
-    write_dense(covariance, out)
-    out[:] = out[::-1, ::-1].copy()
-
-
-@compiled
 def changes_along(
     plant: Plant, network: Network, theta: Vector, states: Matrix, along: Matrix, out: Stack
 ) -> None:
@@ -131,7 +124,7 @@ def changes_along(
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     features, outputs = np.empty((network.feature_kinds.shape[0], N)), np.empty((r, N))
     hidden = np.empty((depth, width * N))
-    write_features(network, states, features)
+    nn.write_features(network, states, features)
     nn.forward(network, theta, features, hidden, outputs)
     signals = batch_back_signals(network, theta, features, hidden, r)
     last = nn.units_by_points(hidden[depth - 1], width, N)
@@ -157,61 +150,34 @@ def _add_products(signal: Matrix, change: Matrix, shift: Vector, out: Vector) ->
             out[n] += delta[n] * (row[n] + b)
 
 
-class Settings(NamedTuple):
-    """Numbers of the policy."""
-
-    steps: int  # H
-    hold: int
-    stride: int
-    plans: int
-    iterations: int
-    elites: int
-    score: int  # dopt.algorithm.Score
-    task_count: int  # states of the evaluation box
-
-
-@compiled
-def settings_of(numbers: Vector) -> Settings:
-    """Return the numbers of the policy by name."""
-    return Settings(
-        int(numbers[0]),
-        int(numbers[1]),
-        int(numbers[2]),
-        int(numbers[3]),
-        int(numbers[4]),
-        int(numbers[5]),
-        int(numbers[6]),
-        int(numbers[7]),
-    )
-
-
 @compiled
 def plan(trial: Trial, t: int, u: Vector) -> None:
     """Write the first input of the best plan, (m,); NaN where M is not positive definite."""
-    settings, gamma, m = settings_of(trial.algorithm.policy), trial.plant.gamma, u.shape[0]
-    E, K = settings.elites, (settings.steps + settings.hold - 1) // settings.hold + 1
-    memory = trial.state.policy_memory.reshape(1 + E, K, m)  # the mean, then the elites
-    definite, draws = True, Directions(np.empty((0, 0)), np.empty((0, 0)))
+    search, gamma, m = trial.algorithm.search, trial.plant.gamma, u.shape[0]
+    E, plans = search.elites, search.plans
+    memory = trial.state.policy_memory.reshape(1 + E, -1, m)  # the mean, then the elites
+    K, definite = memory.shape[1], True
+    draws = Directions(np.empty((0, 0)), np.empty((0, 0)))
     if trial.network.kind != ModelKind.GAUSSIAN_PROCESS:
-        definite, draws = _directions(trial, settings, t)
+        definite, draws = _directions(trial, t)
     if not definite:
         u[:] = np.nan
         return
-    if t % settings.hold == 0:
-        _shift(memory)
-    inputs, values = np.empty((E + settings.plans, K, m)), np.full(E + settings.plans, -np.inf)
+    if t % search.hold == 0:
+        _drop(memory, 1)
+    inputs, values = np.empty((E + plans, K, m)), np.full(E + plans, -np.inf)
     mean, spread = memory[0], np.full((K, m), gamma)
     inputs[:E] = memory[1:]
     blocks = trial.randomness.plans.shape[0]
-    normals = trial.randomness.plans[t % blocks].reshape(settings.iterations, settings.plans, K, m)
-    for iteration in range(settings.iterations):
-        for p in range(settings.plans):
+    normals = trial.randomness.plans[t % blocks].reshape(search.iterations, plans, K, m)
+    for iteration in range(search.iterations):
+        for p in range(plans):
             inputs[E + p] = mean + spread * normals[iteration, p]
             _scale_inputs(inputs[E + p], gamma)
         # The elites of the step before are scored again with the present model; step 1 has none.
         first = 0 if iteration == 0 and t > 1 else E
-        _score(trial, settings, t, draws, inputs[first:], values[first:])
-        best = largest_places(rounded(values), E)
+        _score(trial, t, draws, inputs[first:], values[first:])
+        best = np.argsort(-rounded(values), kind="mergesort")[:E]  # of equal ones the first
         inputs[:E], values[:E] = inputs[best].copy(), values[best].copy()
         _refit(mean, spread, inputs[:E])
     memory[1:] = inputs[:E]
@@ -246,28 +212,6 @@ def rounded(values: Vector) -> Vector:
 
 
 @compiled
-def largest_places(values: Vector, count: int) -> Integers:
-    """Return the places of the largest values in falling order; of equal ones the first."""
-    places = np.empty(count, np.int64)
-    taken = np.zeros(values.shape[0], np.bool_)
-    for n in range(count):
-        best = -1
-        for p in range(values.shape[0]):
-            if not taken[p] and (best < 0 or values[p] > values[best]):
-                best = p
-        taken[best] = True
-        places[n] = best
-    return places
-
-
-@compiled
-def _shift(memory: Stack) -> None:
-    """Drop the first input of every plan, which has been held to its end; repeat the last."""
-    for k in range(memory.shape[1] - 1):
-        memory[:, k] = memory[:, k + 1]
-
-
-@compiled
 def _scale_inputs(inputs: Matrix, gamma: float) -> None:
     """Give every input of a plan, (K, m), the norm γ."""
     for k in range(inputs.shape[0]):
@@ -277,52 +221,49 @@ def _scale_inputs(inputs: Matrix, gamma: float) -> None:
 
 
 @compiled
-def _directions(trial: Trial, settings: Settings, t: int) -> tuple[bool, Directions]:
+def _directions(trial: Trial, t: int) -> tuple[bool, Directions]:
     """Return the directions of the parameters of step t, exact for the rows at task states."""
-    states, count = trial.algorithm.search.task_states, settings.task_count
-    network, gamma, per_state = trial.network, trial.plant.gamma, n_next_points(trial.network)
-    chosen = np.empty((count * per_state, states.shape[1] + network.n_inputs_read))
+    states, count = trial.algorithm.search.task_states, trial.algorithm.search.task_count
+    chosen = np.empty((count, states.shape[1]))
     for i in range(count):
-        at = states[(t * count + i) % states.shape[0]]
-        chosen[i * per_state : (i + 1) * per_state] = next_points(network, at, gamma)
-    rows = rows_at(trial.plant, network, trial.state.theta, chosen)
-    if per_state > 1:
-        rows /= np.sqrt(per_state)
+        chosen[i] = states[(t * count + i) % states.shape[0]]
+    rows = rows_at_states(trial.plant, trial.network, trial.state.theta, chosen)
     return directions(trial.state, trial.randomness.parameters, rows)
 
 
 @compiled
-def _score(
-    trial: Trial, settings: Settings, t: int, draws: Directions, inputs: Stack, values: Vector
-) -> None:
+def _score(trial: Trial, t: int, draws: Directions, inputs: Stack, values: Vector) -> None:
     """Write the scores of plans, (P, K, m); -∞ where a path leaves the bounds of a state."""
-    plant, network, theta = trial.plant, trial.network, trial.state.theta
-    P, n, r = inputs.shape[0], settings.steps // settings.stride, plant.learned_rows.shape[0]
-    inside, points = _paths(trial, settings, t, inputs)
-    d, per_state = trial.record.states.shape[1], n_next_points(network)
+    plant, network, search = trial.plant, trial.network, trial.algorithm.search
+    theta, stride, score = trial.state.theta, search.stride, search.score
+    P, n, r = inputs.shape[0], search.steps // stride, plant.learned_rows.shape[0]
+    starts = np.empty((P, trial.record.states.shape[1]))
+    starts[:] = trial.record.states[t]
+    places = (t + np.arange(n * stride)) // search.hold - t // search.hold
+    rolled = roll(plant, network, theta, starts, inputs, places, 0, stride)
+    points, d, per_state = rolled.points, starts.shape[1], n_next_points(network)
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        _score_process(trial, settings, points, values)
+        _score_process(trial, points, values)
+    else:
+        changes, R = np.empty((r, draws.rows.shape[0], points.shape[0])), r * per_state
+        changes_along(plant, network, theta, points, draws.rows, changes)
+        rows = np.empty((n * R, draws.rows.shape[0]))
+        products, factor = np.empty((2, n * R, n * R))
+        joint = score in (Score.JOINT, Score.TASK)
+        scale = search.row_scale * (np.sqrt(stride) if joint else 1.0)
+        if per_state > 1:
+            scale /= np.sqrt(per_state)
         for p in range(P):
-            values[p] = values[p] if inside[p] and np.isfinite(values[p]) else -np.inf
-        return
-    changes, R = np.empty((r, draws.rows.shape[0], points.shape[0])), r * per_state
-    changes_along(plant, network, theta, points, draws.rows, changes)
-    rows = np.empty((n * R, draws.rows.shape[0]))
-    products, factor = np.empty((2, n * R, n * R))
-    joint = settings.score in (Score.JOINT, Score.TASK)
-    scale = trial.algorithm.search.row_scale * (np.sqrt(settings.stride) if joint else 1.0)
-    if per_state > 1:
-        scale /= np.sqrt(per_state)
+            for i in range(n * per_state):
+                place = p * n * per_state + i
+                weight = scale * domain_weight(search.domain, points[place, :d])
+                for k in range(r):
+                    for j in range(rows.shape[1]):
+                        rows[i * r + k, j] = weight * changes[k, j, place]
+            _write_products(score, rows, R, products)
+            values[p] = score_of_rows(score, products, rows, draws.exact, R, factor)
     for p in range(P):
-        for i in range(n * per_state):
-            place = p * n * per_state + i
-            weight = scale * domain_weight(trial.algorithm.search.domain, points[place, :d])
-            for k in range(r):
-                for j in range(rows.shape[1]):
-                    rows[i * r + k, j] = weight * changes[k, j, place]
-        _write_products(settings.score, rows, R, products)
-        value = score_of_rows(settings.score, products, rows, draws.exact, R, factor)
-        values[p] = value if inside[p] and np.isfinite(value) else -np.inf
+        values[p] = values[p] if rolled.inside[p] and np.isfinite(values[p]) else -np.inf
 
 
 @compiled
@@ -335,11 +276,12 @@ def _write_products(score: int, rows: Matrix, r: int, out: Matrix) -> None:
 
 
 @compiled
-def _score_process(trial: Trial, settings: Settings, points: Matrix, values: Vector) -> None:
+def _score_process(trial: Trial, points: Matrix, values: Vector) -> None:
     """Write the scores of paths, (P,), with a Gaussian process; points, (P n, d), path by path."""
-    network, state, P = trial.network, trial.state, values.shape[0]
-    r, n, joint = trial.plant.learned_rows.shape[0], points.shape[0] // P, Score.JOINT
-    N, weight = n * r, float(settings.stride) if settings.score == joint else 1.0
+    network, state, search = trial.network, trial.state, trial.algorithm.search
+    P, r = values.shape[0], trial.plant.learned_rows.shape[0]
+    n = points.shape[0] // P
+    N, weight = n * r, float(search.stride) if search.score == Score.JOINT else 1.0
     white = np.empty((P * N, network.process.n_samples[0]))
     features = np.empty((P * N, network.sizes[0]))
     gp.write_rows(network, state, r, points, white, features)
@@ -347,7 +289,7 @@ def _score_process(trial: Trial, settings: Settings, points: Matrix, values: Vec
     products, factor, nothing = np.zeros((N, N)), np.empty((N, N)), np.empty((0, 0))
     counted = np.empty(P * n)
     for i in range(P * n):
-        counted[i] = 1.0 if domain_weight(trial.algorithm.search.domain, points[i]) == 1.0 else 0.0
+        counted[i] = 1.0 if domain_weight(search.domain, points[i]) == 1.0 else 0.0
     for p in range(P):
         for i in range(N):
             for j in range(i % r, i + 1, r):
@@ -356,29 +298,7 @@ def _score_process(trial: Trial, settings: Settings, points: Matrix, values: Vec
                 products[i, j] = 0.0
                 if both > 0.0:
                     products[i, j] = both * gp.information(numbers, features, white, a, b)
-        values[p] = score_of_rows(settings.score, products, nothing, nothing, r, factor)
-
-
-@compiled
-def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Booleans, Matrix]:
-    """Return which paths stay in bounds, and the points of their states that count, path by path.
-
-    They are (P n, d), or what :func:`next_points` gives for one state after the other,
-    (2 m P n, d + m).
-    """
-    plant, network, theta = trial.plant, trial.network, trial.state.theta
-    P, d, stride = inputs.shape[0], trial.record.states.shape[1], settings.stride
-    n = settings.steps // stride
-    kept = np.empty((P * n * n_next_points(network), d + network.n_inputs_read))
-    starts = np.empty((P, d))
-    starts[:] = trial.record.states[t]
-    paths = paths_from(plant, network, starts)
-    for i in range(n * stride):
-        k = (t + i) // settings.hold - t // settings.hold
-        advance_paths(plant, network, theta, paths, inputs, k)
-        if (i + 1) % stride == 0:
-            keep_points(plant, network, paths, (i + 1) // stride - 1, n, kept)
-    return paths.inside, kept
+        values[p] = score_of_rows(search.score, products, nothing, nothing, r, factor)
 
 
 @compiled
@@ -435,11 +355,10 @@ def score_of_rows(
 @compiled
 def plan_episodes(trial: Trial, t: int, u: Vector) -> None:
     """Write the next input of the best plan, (m,); NaN where a search finds M indefinite."""
-    numbers = trial.algorithm.policy
-    settings, every = settings_of(numbers), int(numbers[numbers.shape[0] - 1])
-    hold, K = settings.hold, (settings.steps + settings.hold - 1) // settings.hold + 1
-    memory = trial.state.policy_memory.reshape(1 + settings.elites, K, u.shape[0])
+    search = trial.algorithm.search
+    hold, every = search.hold, search.replan_every
     last = max(1, t - t % every)
+    memory = trial.state.policy_memory.reshape(1 + search.elites, -1, u.shape[0])
     if last < t:
         u[:] = memory[1, t // hold - last // hold]  # of the best elite
         return

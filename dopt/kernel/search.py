@@ -19,15 +19,9 @@ import numpy as np
 from dopt.algorithm import INVARIANT, TIE_MARGIN, ModelKind, Score
 from dopt.kernel import gaussian_process as gp
 from dopt.kernel.compiler import compiled, monotonic_microseconds, squared
+from dopt.kernel.integration import write_rate
 from dopt.kernel.linear_algebra import multiply_rows, write_dense
-from dopt.kernel.model import (
-    accelerations_at,
-    euler_step,
-    n_next_points,
-    next_points,
-    rows_at,
-    within,
-)
+from dopt.kernel.model import accelerations_at, n_next_points, next_points, rows_at, within
 from dopt.kernel.network import multiply_vector
 from dopt.kernel.structs import Covariance, Network, Plant, Search, State, Trial
 from dopt.kernel.vectors import add_multiple, inner, multiply, product
@@ -96,13 +90,8 @@ class Path(NamedTuple):
     inverse: Matrix  # (q, q), M⁻¹; empty where few products are needed
     kernels: Matrix  # numbers of Gaussian processes, (r, ·); empty in other models
     weight: float  # by which their covariances are multiplied beside 1/ν
-
-
-class Place(NamedTuple):
-    """Place of the rows of one path among the rows of all paths."""
-
-    shared: int  # R b
-    offset: int  # by which the rows after these are moved
+    shared: int  # R b, rows of a path before the switch
+    block: int  # rows that are taken together: R of a state, or all of a path
 
 
 @compiled
@@ -113,30 +102,17 @@ def new_path(plant: Plant, network: Network, search: Search, state: State) -> Pa
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
         q, p = network.process.n_samples[0], network.sizes[0]
         kernels = gp.numbers_by_row(network, state.theta, plant.learned_rows.shape[0])
-    R, C = rows_of_state(plant, network), search.candidates.shape[0]
-    n, shared = search.steps // search.stride, switch_of(search) // search.stride
-    starts = C if shared > 0 else 1
-    size = covariance.size if R * starts * (shared + C * (n - shared)) > FEW_ROWS else 0
-    inverse, count = np.empty((size, size)), R * (shared + C * (n - shared))
+    R, C = plant.learned_rows.shape[0] * n_next_points(network), search.candidates.shape[0]
+    n, before = search.steps // search.stride, search.switch // search.stride
+    count = R * (before + C * (n - before))
+    size = covariance.size if (C if before > 0 else 1) * count > FEW_ROWS else 0
+    inverse, factor = np.empty((size, size)), np.zeros((R * n, R * n))
     if size > 0:
         write_dense(covariance, inverse)
     weight = float(search.stride) if search.score == Score.JOINT else 1.0
-    factor = np.zeros((R * n, R * n))
-    return Path(np.empty((count, q)), np.empty((count, p)), factor, inverse, kernels, weight)
-
-
-@compiled
-def switch_of(search: Search) -> int:
-    """Return the step at which the input switches, 0 where it never does."""
-    step: int = search.switch if search.switch < search.steps else 0
-    return step
-
-
-@compiled
-def rows_of_state(plant: Plant, network: Network) -> int:
-    """Return R, the number of rows of J that belong to one state of a path."""
-    count: int = plant.learned_rows.shape[0] * n_next_points(network)
-    return count
+    block = R if search.score == Score.SUM else R * n
+    rows, products = np.empty((count, q)), np.empty((count, p))
+    return Path(rows, products, factor, inverse, kernels, weight, R * before, block)
 
 
 @compiled
@@ -154,63 +130,35 @@ def rows_of_points(plant: Plant, network: Network, theta: Vector, points: Matrix
 
 
 @compiled
-def add_rows(
-    plant: Plant,
-    network: Network,
-    search: Search,
-    state: State,
-    points: Matrix,
-    path: Path,
-    first: int,
-) -> None:
-    """Write the rows at points and their products with M⁻¹, from row ``first``.
-
-    They are in the units of M, for the determinant of all of them together times the root of the
-    stride.
-    """
-    if path.kernels.shape[0] > 0:
-        r = plant.learned_rows.shape[0]
-        gp.write_rows(network, state, r, points, path.rows[first:], path.products[first:])
-        return
-    weight = search.row_scale
-    if search.score == Score.JOINT:
-        weight *= np.sqrt(search.stride)
-    last: int = first + points.shape[0] * plant.learned_rows.shape[0]
-    rows = path.rows[first:last]
-    rows[:] = rows_of_points(plant, network, state.theta, points)
-    if weight != 1.0:
-        rows *= weight
-    _apply_inverse(state.covariance, path, first, last)
+def rows_at_states(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Matrix:
+    """Return the rows of J at the next points of states, (n, d), one state after the other."""
+    n, per_state = states.shape[0], n_next_points(network)
+    points = np.empty((n * per_state, states.shape[1] + network.n_inputs_read))
+    for i in range(n):
+        at = next_points(network, states[i], plant.gamma)
+        points[i * per_state : (i + 1) * per_state] = at
+    return rows_of_points(plant, network, theta, points)
 
 
 @compiled
-def _apply_inverse(covariance: Covariance, path: Path, first: int, last: int) -> None:
-    """Write the products of rows ``first`` to ``last`` with M⁻¹."""
-    if path.inverse.shape[0] == 0:
-        multiply_rows(covariance, path.rows[first:last], path.products[first:last])
-    elif last > first:
-        multiply(path.rows[first:last], path.inverse, path.products[first:last])
+def row_at(path: Path, offset: int, i: int) -> int:
+    """Return where the i-th row of a path is, whose rows after the switch are moved so far."""
+    return i if i < path.shared else i + offset
 
 
 @compiled
-def row_at(place: Place, i: int) -> int:
-    """Return where the i-th row of a path is."""
-    return i if i < place.shared else i + place.offset
-
-
-@compiled
-def log_determinant(path: Path, place: Place, first: int, last: int, block: int) -> float:
+def log_determinant(path: Path, offset: int, first: int, last: int) -> float:
     """Extend the factor L by rows ``first`` to ``last`` of a path; return the growth of log det.
 
-    Only rows of the same block of so many are taken together: all of them for the determinant of
-    the whole path, r for its states one by one.
+    Only rows of the same block are taken together: all of them for the determinant of the whole
+    path, R for its states one by one.
     """
     L = path.factor
     total = 0.0
     for i in range(first, last):
-        start = i - i % block
+        start = i - i % path.block
         for j in range(start, i + 1):
-            value = _product_of_rows(path, place, i, j)
+            value = _product_of_rows(path, offset, i, j)
             value -= inner(L[i, start:j], L[j, start:j])
             L[i, j] = np.sqrt(1.0 + value) if i == j else value / L[j, j]
         total += 2.0 * np.log(L[i, i])
@@ -218,9 +166,9 @@ def log_determinant(path: Path, place: Place, first: int, last: int, block: int)
 
 
 @compiled
-def _product_of_rows(path: Path, place: Place, i: int, j: int) -> float:
+def _product_of_rows(path: Path, offset: int, i: int, j: int) -> float:
     """Return J M⁻¹ Jᵀ of the i-th and the j-th row of a path."""
-    a, b = row_at(place, i), row_at(place, j)
+    a, b = row_at(path, offset, i), row_at(path, offset, j)
     value: float
     if path.kernels.shape[0] == 0:
         value = inner(path.products[a], path.rows[b])
@@ -230,13 +178,13 @@ def _product_of_rows(path: Path, place: Place, i: int, j: int) -> float:
 
 
 @compiled
-def whitened(path: Path, place: Place) -> Matrix:
+def whitened(path: Path, offset: int) -> Matrix:
     """Return L⁻¹ J M⁻¹, (R n, q), of a path whose factor is known."""
     n = path.factor.shape[0]
     out = np.empty((n, path.products.shape[1]))
     for i in range(n):
         row = out[i]
-        row[:] = path.products[row_at(place, i)]
+        row[:] = path.products[row_at(path, offset, i)]
         for j in range(i):
             add_multiple(row, -path.factor[i, j], out[j])
         for j in range(row.shape[0]):
@@ -244,64 +192,57 @@ def whitened(path: Path, place: Place) -> Matrix:
     return out
 
 
-class Paths(NamedTuple):
-    """Paths at their present step; written in place."""
+class Rolled(NamedTuple):
+    """Paths from one state to another."""
 
-    states: Matrix  # (P, d)
-    inside: Booleans  # (P,), whether all states so far are within bounds
-    points: Matrix  # (P, ·), what the model depends on: the states, or states and inputs
-    outputs: Matrix  # (r, P), a_θ there
-    value: Vector  # (r,), of one path
-    flow: Vector  # (d,)
-    following: Vector  # (d,)
+    ends: Matrix  # (P, d)
+    inside: Booleans  # (P,), whether all states are within bounds
+    points: Matrix  # next points of the states whose rows count, path by path
 
 
 @compiled
-def paths_from(plant: Plant, network: Network, starts: Matrix) -> Paths:
-    """Return paths that start at states, (P, d)."""
-    (P, d), r = starts.shape, plant.learned_rows.shape[0]
-    states = starts.copy()
-    return Paths(
-        states,
-        np.ones(P, np.bool_),
-        states if network.n_inputs_read == 0 else np.empty((P, d + network.n_inputs_read)),
-        np.empty((r, P)),
-        np.empty(r),
-        np.empty(d),
-        np.empty(d),
-    )
+def roll(
+    plant: Plant,
+    network: Network,
+    theta: Vector,
+    starts: Matrix,
+    inputs: Stack,
+    places: Integers,
+    first: int,
+    stride: int,
+) -> Rolled:
+    """Take paths from states, (P, d), step by step to x + dt f_θ(x, u), all of them together.
 
-
-@compiled
-def advance_paths(
-    plant: Plant, network: Network, theta: Vector, paths: Paths, inputs: Stack, k: int
-) -> None:
-    """Take every path one step x + dt f_θ(x, u) further under its k-th input of (P, K, m)."""
-    P, d = paths.states.shape
-    if network.n_inputs_read > 0:
-        paths.points[:, :d] = paths.states
-        paths.points[:, d:] = inputs[:, k]
-    accelerations_at(plant, network, theta, paths.points, paths.outputs)
-    for p in range(P):
-        for j in range(paths.value.shape[0]):
-            paths.value[j] = paths.outputs[j, p]
-        euler_step(plant, paths.states[p], inputs[p, k], paths.value, paths.flow, paths.following)
-        paths.inside[p] = paths.inside[p] and within(paths.following, plant.state_limit)
-        for j in range(d):
-            paths.states[p, j] = paths.following[j]
-
-
-@compiled
-def keep_points(plant: Plant, network: Network, paths: Paths, i: int, n: int, kept: Matrix) -> None:
-    """Write the points of the present states as the i-th of n of every path.
-
-    They are :func:`dopt.kernel.model.next_points`, path by path.
+    ``places``, one for each step, are the places of its input among the K of each path, (P, K, m).
+    Rows count after every step whose number, from ``first`` on, is a multiple of the stride.
     """
-    per_state = n_next_points(network)
-    for p in range(paths.states.shape[0]):
-        place = per_state * (p * n + i)
-        points = next_points(network, paths.states[p], plant.gamma)
-        kept[place : place + per_state] = points
+    (P, d), r, per_state = starts.shape, plant.learned_rows.shape[0], n_next_points(network)
+    m_read, last = network.n_inputs_read, first + places.shape[0]
+    n = last // stride - first // stride
+    states, inside, kept = (
+        starts.copy(),
+        np.ones(P, np.bool_),
+        np.empty((P * n * per_state, d + m_read)),
+    )
+    points = states if m_read == 0 else np.empty((P, d + m_read))
+    outputs, value, flow = np.empty((r, P)), np.empty(r), np.empty(d)
+    for i in range(first, last):
+        k = places[i - first]
+        if m_read > 0:
+            points[:, :d] = states
+            points[:, d:] = inputs[:, k]
+        accelerations_at(plant, network, theta, points, outputs)
+        for p in range(P):
+            for j in range(r):
+                value[j] = outputs[j, p]
+            write_rate(plant, states[p], inputs[p, k], value, flow)
+            for j in range(d):
+                states[p, j] += plant.dt * flow[j]
+            inside[p] = inside[p] and within(states[p], plant.state_limit)
+            if (i + 1) % stride == 0:
+                place = per_state * (p * n + (i + 1) // stride - first // stride - 1)
+                kept[place : place + per_state] = next_points(network, states[p], plant.gamma)
+    return Rolled(states, inside, kept)
 
 
 class ScoreContext(NamedTuple):
@@ -312,14 +253,14 @@ class ScoreContext(NamedTuple):
 
 
 @compiled
-def score_of_path(score: int, path: Path, place: Place, context: ScoreContext) -> float:
+def score_of_path(score: int, path: Path, offset: int, context: ScoreContext) -> float:
     """Return the score of a whole path whose factor is known, if it is not a determinant."""
     n, total = path.factor.shape[0], 0.0
     if score == Score.TRACE:
         for i in range(n):
-            total += _product_of_rows(path, place, i, i)
+            total += _product_of_rows(path, offset, i, i)
         return total
-    white = whitened(path, place)
+    white = whitened(path, offset)
     if score == Score.E:
         return -largest_eigenvalue(context.projected, context.probes, white)
     for i in range(n):
@@ -338,13 +279,8 @@ def score_context(
     if search.score == Score.E:
         basis, projected = krylov_space(covariance, search.starts, search.subspace)
         return ScoreContext(basis, projected)
-    n = search.task_states.shape[0] if search.score == Score.TASK else 0
-    per_state = n_next_points(network)
-    points = np.empty((n * per_state, search.task_states.shape[1] + network.n_inputs_read))
-    for s in range(n):
-        at = next_points(network, search.task_states[s], plant.gamma)
-        points[s * per_state : (s + 1) * per_state] = at
-    return ScoreContext(rows_of_points(plant, network, theta, points), np.empty((0, 0)))
+    states = search.task_states if search.score == Score.TASK else search.task_states[:0]
+    return ScoreContext(rows_at_states(plant, network, theta, states), np.empty((0, 0)))
 
 
 class Problem(NamedTuple):
@@ -360,14 +296,6 @@ class Problem(NamedTuple):
     end: float  # when the time is spent [µs]
 
 
-class Halves(NamedTuple):
-    """Paths from one state to another, each under one candidate."""
-
-    ends: Matrix  # (P, d)
-    inside: Booleans  # (P,), whether all states are within bounds
-    points: Matrix  # points of the states whose rows count, path by path
-
-
 @compiled
 def plan(trial: Trial, t: int, u: Vector) -> None:
     """Write the first input of the best plan that was found in time, (m,)."""
@@ -378,12 +306,10 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
     path = new_path(plant, network, search, state)
     context = score_context(plant, network, search, state.theta, state.covariance)
     problem = Problem(plant, network, search, state, x, path, context, end)
-    hurried = search.budget_us > 0.0
-    values = (
-        _values_in_time(problem, _order(search.candidates, tie))
-        if hurried
-        else _all_values(problem)
-    )
+    if search.budget_us > 0.0:
+        values = _values_in_time(problem, _order(search.candidates, tie))
+    else:
+        values = _all_values(problem)
     _choose(values, search.candidates, tie, u)
 
 
@@ -405,7 +331,7 @@ def _order(candidates: Matrix, tie: Vector) -> Integers:
 @compiled
 def _all_values(problem: Problem) -> Matrix:
     """Return the scores of plans by their two candidates, (C, C); -∞ for pairs without a plan."""
-    C, switch = problem.search.candidates.shape[0], switch_of(problem.search)
+    C, switch = problem.search.candidates.shape[0], problem.search.switch
     values, candidates = np.full((C, C), -np.inf), np.arange(C)
     first = candidates if switch > 0 else candidates[:1]
     n = first.shape[0]
@@ -432,7 +358,7 @@ def _values_in_time(problem: Problem, order: Integers) -> Matrix:
             return values
         _score_one_by_one(problem, order[k], order[k : k + 1], values)
     done = np.zeros(C, np.bool_)
-    for _ in range(C if switch_of(problem.search) > 0 else 0):
+    for _ in range(C if problem.search.switch > 0 else 0):
         if _late(problem):
             return values
         c = _best_hold(values, done)
@@ -471,95 +397,84 @@ def _late(problem: Problem) -> bool:
 
 
 @compiled
-def _begin(problem: Problem, chosen: Integers) -> Halves:
+def _begin(problem: Problem, chosen: Integers) -> Rolled:
     """Hold candidates from the present state up to the switch."""
-    x, search = problem.x, problem.search
-    starts = np.empty((chosen.shape[0], x.shape[0]))
-    starts[:] = x
-    return _roll(problem, starts, search.candidates[chosen], 0, switch_of(search))
+    starts = np.empty((chosen.shape[0], problem.x.shape[0]))
+    starts[:] = problem.x
+    return _held(problem, starts, chosen, 0, problem.search.switch)
 
 
 @compiled
-def _end(problem: Problem, begun: Halves, paths: Integers, chosen: Integers) -> Halves:
+def _end(problem: Problem, begun: Rolled, paths: Integers, chosen: Integers) -> Rolled:
     """Hold candidates from the ends of paths up to the switch to the end of the plan."""
     search = problem.search
-    inputs, switch = search.candidates[chosen], switch_of(search)
-    ended = _roll(problem, begun.ends[paths], inputs, switch, search.steps)
-    return Halves(ended.ends, ended.inside & begun.inside[paths], ended.points)
+    ended = _held(problem, begun.ends[paths], chosen, search.switch, search.steps)
+    return Rolled(ended.ends, ended.inside & begun.inside[paths], ended.points)
 
 
 @compiled
-def _roll(problem: Problem, starts: Matrix, inputs: Matrix, first: int, last: int) -> Halves:
-    """Hold inputs, (P, m), from states, (P, d), at step ``first`` to step ``last``."""
-    plant, network, stride = problem.plant, problem.network, problem.search.stride
-    (P, d), (_, m) = starts.shape, inputs.shape
-    n = last // stride - first // stride
-    kept = np.empty((P * n * n_next_points(network), d + network.n_inputs_read))
-    paths, held = paths_from(plant, network, starts), inputs.reshape(P, 1, m)
-    for i in range(first, last):
-        advance_paths(plant, network, problem.state.theta, paths, held, 0)
-        if (i + 1) % stride == 0:
-            place = (i + 1) // stride - first // stride - 1
-            keep_points(plant, network, paths, place, n, kept)
-    return Halves(paths.states, paths.inside, kept)
+def _held(problem: Problem, starts: Matrix, chosen: Integers, first: int, last: int) -> Rolled:
+    """Hold candidates from states, (P, d), at step ``first`` to step ``last``."""
+    plant, network, theta = problem.plant, problem.network, problem.state.theta
+    inputs, places = problem.search.candidates[chosen], np.zeros(last - first, np.int64)
+    held = inputs.reshape(inputs.shape[0], 1, inputs.shape[1])
+    return roll(plant, network, theta, starts, held, places, first, problem.search.stride)
 
 
 @compiled
-def _share(problem: Problem, begun: Halves, k: int) -> float:
+def _share(problem: Problem, begun: Rolled, k: int) -> float:
     """Make the rows of path k up to the switch those that plans share; return their log det."""
     _write_rows(problem, begun, k, 1, 0)
-    shared = _shared_rows(problem)
-    gain: float = log_determinant(problem.path, Place(shared, 0), 0, shared, _block(problem))
+    gain: float = log_determinant(problem.path, 0, 0, problem.path.shared)
     return gain
 
 
 @compiled
-def _scores(problem: Problem, begun: float, ended: Halves, first: int, count: int) -> Vector:
+def _scores(problem: Problem, begun: float, ended: Rolled, first: int, count: int) -> Vector:
     """Return the scores of the plans that end with so many paths, given log det up to the switch.
 
     They are -∞ where the path leaves the bounds of a state, or the score is not finite.
     """
-    search, path = problem.search, problem.path
-    shared, n = _shared_rows(problem), path.factor.shape[0]
-    _write_rows(problem, ended, first, count, shared)
+    score, path, n = problem.search.score, problem.path, problem.path.factor.shape[0]
+    _write_rows(problem, ended, first, count, path.shared)
     scores = np.full(count, -np.inf)
     for k in range(count):
         if not ended.inside[first + k]:
             continue
-        place = Place(shared, k * (n - shared))
-        value = begun + log_determinant(path, place, shared, n, _block(problem))
-        if search.score not in (Score.JOINT, Score.SUM):
-            value = score_of_path(search.score, path, place, problem.context)
+        offset = k * (n - path.shared)
+        value = begun + log_determinant(path, offset, path.shared, n)
+        if score not in (Score.JOINT, Score.SUM):
+            value = score_of_path(score, path, offset, problem.context)
         scores[k] = value if np.isfinite(value) else -np.inf
     return scores
 
 
 @compiled
-def _write_rows(problem: Problem, halves: Halves, first: int, count: int, row: int) -> None:
-    """Write the rows of so many paths and their products, from a row on."""
-    n = halves.points.shape[0] // halves.ends.shape[0]
-    points = halves.points[first * n : (first + count) * n]
-    plant, network, search = problem.plant, problem.network, problem.search
-    add_rows(plant, network, search, problem.state, points, problem.path, row)
+def _write_rows(problem: Problem, rolled: Rolled, first: int, count: int, row: int) -> None:
+    """Write the rows of so many paths and their products with M⁻¹, from a row on.
 
-
-@compiled
-def _shared_rows(problem: Problem) -> int:
-    """Return how many rows of a path come before the switch."""
-    search = problem.search
-    count: int = rows_of_state(problem.plant, problem.network) * (
-        switch_of(search) // search.stride
-    )
-    return count
-
-
-@compiled
-def _block(problem: Problem) -> int:
-    """Return how many rows are taken together: the rows of a state, or of the whole path."""
-    if problem.search.score == Score.SUM:
-        return rows_of_state(problem.plant, problem.network)
-    n: int = problem.path.factor.shape[0]
-    return n
+    They are in the units of M, for the determinant of all of them together times the root of the
+    stride.
+    """
+    plant, network, search, state = problem.plant, problem.network, problem.search, problem.state
+    path, r = problem.path, plant.learned_rows.shape[0]
+    n = rolled.points.shape[0] // rolled.ends.shape[0]
+    points = rolled.points[first * n : (first + count) * n]
+    last = row + points.shape[0] * r
+    rows, products = path.rows[row:last], path.products[row:last]
+    if path.kernels.shape[0] > 0:
+        gp.write_rows(network, state, r, points, rows, products)
+        return
+    weight = search.row_scale
+    if search.score == Score.JOINT:
+        weight *= np.sqrt(search.stride)
+    rows[:] = rows_of_points(plant, network, state.theta, points)
+    if weight != 1.0:
+        rows *= weight
+    if path.inverse.shape[0] == 0:
+        multiply_rows(state.covariance, rows, products)
+    elif last > row:
+        multiply(rows, path.inverse, products)
 
 
 @compiled

@@ -174,12 +174,16 @@ def move_sensitivity(A: Matrix, J: Matrix, rows: Integers, dt: float, sensitivit
 
 
 @compiled
-def covariances(P: Matrix, output: Vector) -> Vector:
-    """Return P c, (d,), the covariances of the state with an output, given its row c of C, (d,)."""
-    found = np.empty(P.shape[0])
-    for i in range(P.shape[0]):
-        found[i] = inner(P[i], output)
-    return found
+def innovation(trial: Trial, t: int, i: int, x: Vector, P: Matrix) -> tuple[float, Vector, float]:
+    """Return y - c x of output i after step t at a predicted state, (d,), K, (d,), and s."""
+    sensors = trial.sensors
+    output, gain = sensors.output_matrix[i], np.empty(P.shape[0])
+    for j in range(P.shape[0]):
+        gain[j] = inner(P[j], output)
+    error = trial.state.estimate.outputs[t, i] - inner(output, x)
+    variance = inner(output, gain) + sensors.variances[i]
+    gain /= variance
+    return error, gain, variance
 
 
 @compiled

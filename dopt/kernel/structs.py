@@ -230,16 +230,22 @@ class Search(NamedTuple):
     """Plans among which a policy chooses (:mod:`dopt.policies.search`); none in others."""
 
     candidates: Matrix  # (C, m)
-    score: int  # dopt.algorithm.Score
-    steps: int  # H
-    switch: int  # steps after which the input may switch, H where it may not
-    stride: int
-    budget_us: float
     task_states: Matrix  # (n, d)
     domain: Matrix  # (2, d), half-widths of the box in which rows count, and periods (0: none)
     starts: Matrix  # (b, q) of the Krylov space
-    subspace: int
     row_scale: float  # 1/√ρ, by which the rows of a path are multiplied: a sample adds JᵀJ/ρ to M
+    score: int = 0  # dopt.algorithm.Score
+    steps: int = 0  # H
+    switch: int = 0  # steps after which the input may switch, 0 where it may not
+    stride: int = 1
+    budget_us: float = 0.0
+    subspace: int = 0
+    hold: int = 1  # steps for which an input of a sampled plan is held
+    plans: int = 0  # sampled in an iteration
+    iterations: int = 0
+    elites: int = 0
+    task_count: int = 0  # task states of a step
+    replan_every: int = 1  # steps from one search to the next
 
 
 class Algorithm(NamedTuple):

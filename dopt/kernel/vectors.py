@@ -30,7 +30,7 @@ from numba.extending import intrinsic
 
 from dopt.kernel import plain
 from dopt.kernel.compiler import compiled
-from dopt.types import Matrix, NumbaType, Vector
+from dopt.types import Matrix
 
 LANES = 8
 """Doubles of a vector; arrays that are padded to a multiple of it have no incomplete one."""
@@ -89,7 +89,7 @@ class _Code:
         self._call(f"masked.store.{self._name}.p0", ir.VoidType(), arguments)
 
     def splat(self, value: Any) -> Any:
-        nothing = ir.Constant(self.vector, ir.Undefined)
+        nothing = ir.Constant(ir.VectorType(value.type, self.lanes), ir.Undefined)
         one = self.builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
         places = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
         return self.builder.shuffle_vector(one, nothing, places)
@@ -113,17 +113,12 @@ class _Code:
 
     def first(self, count: Any) -> Any:
         """Return a mask of the first lanes."""
-        kind = ir.VectorType(_INDEX, self.lanes)
-        nothing = ir.Constant(kind, ir.Undefined)
-        one = self.builder.insert_element(nothing, count, ir.Constant(ir.IntType(32), 0))
-        places = ir.Constant(ir.VectorType(ir.IntType(32), self.lanes), [0] * self.lanes)
-        counts = self.builder.shuffle_vector(one, nothing, places)
-        return self.builder.icmp_signed("<", ir.Constant(kind, [*range(self.lanes)]), counts)
+        counts = self.splat(count)
+        places = ir.Constant(counts.type, [*range(self.lanes)])
+        return self.builder.icmp_signed("<", places, counts)
 
     def variable(self, value: Any) -> Any:
-        slot = cgutils.alloca_once(self.builder, value.type)
-        self.builder.store(value, slot)
-        return slot
+        return cgutils.alloca_once_value(self.builder, value)
 
     def add_to(self, slot: Any, a: Any, b: Any) -> None:
         """Add a product to a variable."""
@@ -200,34 +195,48 @@ def _arrays(context: Any, builder: Any, signature: Any, arguments: Any) -> list[
     return [_Array(context, builder, kind, value) for kind, value in given]
 
 
-def _product(start: str, sign: int, upper: bool) -> Callable[..., Any]:
-    """Return the code of a product of matrices.
+def _generator(start: str, sign: int, upper: bool) -> Callable[..., Any]:
+    """Return what generates the code of a product of matrices.
 
     ``start`` says what sums begin with: "out", the result's own entry, "bias", an entry for each
     row, or "zero". ``upper``: only the blocks of :data:`LANES` rows and columns on and above the
     diagonal.
     """
 
-    def typed(typing_context: NumbaType, left: Any, right: Any, *others: Any) -> Any:  # noqa: ARG001
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            a, b, *rest = _arrays(context, builder, signature, arguments)
-            out = rest[-1]
-            bias = rest[0].data if start == "bias" else out.data
-            many = _has_many_registers(context)
-            height, vectors = (8, 2) if many else (4, 1)
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        a, b, *rest = _arrays(context, builder, signature, arguments)
+        out = rest[-1]
+        bias = rest[0].data if start == "bias" else out.data
+        height, vectors = (8, 2) if _has_many_registers(context) else (4, 1)
 
-            def write(code: _Code, *given: Any) -> None:
-                _write_product(code, start, sign, upper, height, vectors, *given)
+        def write(code: _Code, *given: Any) -> None:
+            _write_product(code, start, sign, upper, height, vectors, *given)
 
-            sizes = (out.shape[0], out.shape[1], a.shape[1])
-            places = (a.data, *a.strides, b.data, b.strides[0], bias, out.data, out.strides[0])
-            name = f"product.{start}.{sign}.{upper}"
-            _routine(builder, name, out.element, (*sizes, *places), write)
-            return context.get_dummy_value()
+        sizes = (out.shape[0], out.shape[1], a.shape[1])
+        places = (a.data, *a.strides, b.data, b.strides[0], bias, out.data, out.strides[0])
+        _routine(builder, f"product.{start}.{sign}.{upper}", out.element, (*sizes, *places), write)
+        return context.get_dummy_value()
 
-        return types.void(left, right, *others), generate
+    return generate
 
-    return typed
+
+def _in_numpy(left: Matrix, right: Matrix, out: Matrix) -> Matrix:
+    """Return as much of a product as is written into ``out``; factors may be larger."""
+    n, m = out.shape
+    part: Matrix = left[:n] @ right[: left.shape[1], :m]
+    return part
+
+
+def _product(start: str, sign: int, *, upper: bool = False) -> Any:
+    """Return a product of matrices (n, k) and (k, m) for compiled code; see :func:`_generator`."""
+
+    def in_numpy(left: Matrix, right: Matrix, out: Matrix) -> None:
+        out[:] = sign * _in_numpy(left, right, out) + (out if start == "out" else 0.0)
+
+    def typed(typing_context, left, right, out):  # type: ignore[no-untyped-def]  # noqa: ARG001  # Numba's signature
+        return types.void(left, right, out), _generator(start, sign, upper)
+
+    return plain.or_plain(in_numpy)(intrinsic(typed))
 
 
 def _write_product(
@@ -292,72 +301,33 @@ def _write_product(
         rows(i, 1)
 
 
-def _plain_multiply(left: Matrix, right: Matrix, out: Matrix) -> None:
-    out[:] = left @ right
+multiply = _product("zero", 1)
+"""Write the product of matrices (n, k) and (k, m)."""
+
+add_product = _product("out", 1)
+"""Add the product of matrices (n, k) and (k, m)."""
+
+subtract_product = _product("out", -1)
+"""Subtract the product of matrices (n, k) and (k, m)."""
+
+subtract_symmetric = _product("out", -1, upper=True)
+"""Subtract a symmetric product from the blocks on and above the diagonal of a matrix, (q, q).
+
+Blocks have :data:`LANES` rows and columns; those on the diagonal are whole.
+"""
+
+add_symmetric = _product("out", 1, upper=True)
+"""Add a symmetric product as :func:`subtract_symmetric` subtracts one."""
 
 
-def _plain_add_bias(left: Matrix, right: Matrix, bias: Vector, out: Matrix) -> None:
-    out[:] = left @ right + bias[:, None]
-
-
-def _plain_add(left: Matrix, right: Matrix, out: Matrix) -> None:
-    out += left @ right
-
-
-def _plain_subtract(left: Matrix, right: Matrix, out: Matrix) -> None:
-    out -= left @ right
-
-
-@plain.or_plain(_plain_multiply)
+@plain.or_plain(lambda a, b, bias, out: np.add(_in_numpy(a, b, out), bias[:, None], out=out))
 @intrinsic
-def multiply(typing_context, left, right, out):  # type: ignore[no-untyped-def]  # Numba's signature
-    """Write the product of matrices (n, k) and (k, m)."""
-    return _product("zero", 1, upper=False)(typing_context, left, right, out)
-
-
-@plain.or_plain(_plain_add_bias)
-@intrinsic
-def multiply_and_shift(typing_context, left, right, bias, out):  # type: ignore[no-untyped-def]
+def multiply_and_shift(typing_context, left, right, bias, out):  # type: ignore[no-untyped-def]  # noqa: ARG001
     """Write the product of matrices (n, k) and (k, m) plus a column, (n,)."""
-    return _product("bias", 1, upper=False)(typing_context, left, right, bias, out)
+    return types.void(left, right, bias, out), _generator("bias", 1, upper=False)
 
 
-@plain.or_plain(_plain_add)
-@intrinsic
-def add_product(typing_context, left, right, out):  # type: ignore[no-untyped-def]
-    """Add the product of matrices (n, k) and (k, m)."""
-    return _product("out", 1, upper=False)(typing_context, left, right, out)
-
-
-@plain.or_plain(_plain_subtract)
-@intrinsic
-def subtract_product(typing_context, left, right, out):  # type: ignore[no-untyped-def]
-    """Subtract the product of matrices (n, k) and (k, m)."""
-    return _product("out", -1, upper=False)(typing_context, left, right, out)
-
-
-@plain.or_plain(_plain_subtract)
-@intrinsic
-def subtract_symmetric(typing_context, left, right, out):  # type: ignore[no-untyped-def]
-    """Subtract a symmetric product from the blocks on and above the diagonal of a matrix, (q, q).
-
-    Blocks have :data:`LANES` rows and columns; those on the diagonal are whole.
-    """
-    return _product("out", -1, upper=True)(typing_context, left, right, out)
-
-
-@plain.or_plain(_plain_add)
-@intrinsic
-def add_symmetric(typing_context, left, right, out):  # type: ignore[no-untyped-def]
-    """Add a symmetric product as :func:`subtract_symmetric` subtracts one."""
-    return _product("out", 1, upper=True)(typing_context, left, right, out)
-
-
-def _plain_inner_products(left: Matrix, right: Matrix, out: Matrix) -> None:
-    out[:] = left @ right.T
-
-
-@plain.or_plain(_plain_inner_products)
+@plain.or_plain(lambda a, b, out: np.copyto(out, _in_numpy(a, b.T, out)))
 @intrinsic
 def inner_products(typing_context, left, right, out):  # type: ignore[no-untyped-def]  # noqa: ARG001
     """Write the inner products of the rows of two matrices, (n, k) and (m, k), (n, m)."""
@@ -465,11 +435,7 @@ def _write_inner(code: _Code, n: Any, a: Any, b: Any, result: Any) -> None:
     builder.store(code.total(builder.fadd(builder.fadd(w, x), builder.fadd(y, z))), result)
 
 
-def _plain_symmetric_products(upper: Matrix, x: Matrix, y: Matrix) -> None:
-    y[:] = x @ (np.triu(upper) + np.triu(upper, 1).T)
-
-
-@plain.or_plain(_plain_symmetric_products)
+@plain.or_plain(lambda upper, x, y: np.matmul(x, np.triu(upper) + np.triu(upper, 1).T, out=y))
 @intrinsic
 def _group_products(typing_context, upper, x, y):  # type: ignore[no-untyped-def]  # noqa: ARG001
     """Write the products of at most :data:`GROUP` rows with a symmetric matrix."""
@@ -551,11 +517,7 @@ def symmetric_products(upper: Matrix, x: Matrix, y: Matrix) -> None:
         _group_products(upper, x[i:last], y[i:last])
 
 
-def _plain_add_multiple(y: Vector, factor: float, x: Vector) -> None:
-    y += factor * x
-
-
-@plain.or_plain(_plain_add_multiple)
+@plain.or_plain(lambda y, factor, x: np.add(y, factor * x, out=y))
 @intrinsic
 def add_multiple(typing_context, y, factor, x):  # type: ignore[no-untyped-def]  # noqa: ARG001
     """Add factor x to y, (n,)."""

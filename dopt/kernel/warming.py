@@ -25,12 +25,13 @@ from numba.core.cpu import CPUContext
 from numba.core.targetconfig import ConfigStack
 
 from dopt.algorithm import Integrator
-from dopt.kernel import cache, loop
+from dopt.fields import IN_NUMPY
+from dopt.kernel import cache
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.from_spec import information_of
 from dopt.kernel.gaussian_process import negative_evidence, refactor, thin
 from dopt.kernel.held import hold
-from dopt.kernel.information import ABSENT, FORMS, NETWORK, OF_OTHER_MODELS
+from dopt.kernel.information import ABSENT, FORMS, PRIMAL
 from dopt.kernel.loop import advance, evaluate_next
 from dopt.kernel.pointers import (
     BETWEEN,
@@ -38,9 +39,7 @@ from dopt.kernel.pointers import (
     STEPS,
     compile_form,
     compiled_at,
-    compiled_evaluation,
     compiled_for,
-    compiled_loop,
     compiled_step,
     kind_of,
     names_of,
@@ -118,15 +117,11 @@ def choices(everything: bool) -> Choices:
         return Choices(
             [policy.kernel_function for policy in (DOptimal, Uniform, Periodic)],
             [learner.kernel_function for learner in (Adam, RecursiveLeastSquares)],
-            (NETWORK, OF_OTHER_MODELS, ABSENT),
+            (PRIMAL, ABSENT),
         )
     plans = {policy.kernel_function for policy in POLICIES.values() if policy.compiled}
     learns = {learner.kernel_function for learner in LEARNERS.values() if learner.compiled}
-    return Choices(
-        sorted(plans | {path_of(loop.plan_in_numpy)}),
-        sorted(learns | {path_of(loop.learn_in_numpy)}),
-        FORMS,
-    )
+    return Choices(sorted(plans - {IN_NUMPY}), sorted(learns - {IN_NUMPY}), FORMS)
 
 
 def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
@@ -141,7 +136,7 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
     }
     systems = [system() for system in SYSTEMS.values()]
     forms = [pair for form in chosen.forms for pair in form._asdict().items()]
-    steps, whole = (*STEPS, *BETWEEN) if everything else STEPS[:1], (trial.trial, trial.points)
+    steps = (advance, evaluate_next, *STEPS, *BETWEEN) if everything else (advance, hold)
     process = trial.trial.network, trial.trial.state.theta, trial.trial.state.posterior
     row = process[1]
     fits: dict[CompiledFunction, tuple[object, ...]] = {
@@ -149,18 +144,15 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
         refactor: process,
         negative_evidence: (row, np.zeros((1, 1)), row, row, row),
     }
-    evaluation = {path_of(evaluate_next): partial(compiled_evaluation, *whole)}
     return {
-        path_of(advance): partial(compiled_loop, *whole),
-        **(evaluation if everything else {}),
-        **{path_of(step): partial(compiled_step, trial.trial, step) for step in steps},
-        **{path_of(one): partial(compiled_at, path_of(one), others[one]) for one in others},
+        **{path_of(one): partial(compiled_step, trial.trial, one, trial.points) for one in steps},
+        **{path_of(one): partial(compiled_for, one, kind.args) for one, kind in others.items()},
         **{path: partial(compiled_at, path, kinds.learn) for path in chosen.learns},
         **{name_of_equations(system): partial(compiled_equations, system) for system in systems},
         **{path_of(form): partial(compile_form, trial.trial, name, form) for name, form in forms},
         **{path: partial(compiled_at, path, kinds.plan) for path in chosen.plans},
         **{
-            path_of(fit): partial(compiled_for, path_of(fit), fit, tuple(map(kind_of, given)))
+            path_of(fit): partial(compiled_for, fit, tuple(map(kind_of, given)))
             for fit, given in fits.items()
             if everything
         },

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.fields import LEARN_IN_NUMPY, KernelPart, parameter
-from dopt.registry import check_returned
+from dopt.fields import IN_NUMPY, KernelPart, parameter
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 from dopt.types import Array as Array
@@ -64,28 +61,11 @@ class CustomLearner(Learner):
     """
 
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = LEARN_IN_NUMPY
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if "updater" in cls.__dict__:
-            cls.updater = _checked(cls.updater)  # type: ignore[method-assign]
+    kernel_function: ClassVar[str] = IN_NUMPY
 
     @abstractmethod
     def updater(self, system: System, rng: np.random.Generator) -> Updater:
         """Return the learning of a new trial; all that is random in it comes from ``rng``."""
-
-
-def _checked(make: Callable[..., Updater]) -> Callable[..., Updater]:
-    """Return a method that makes an updater and refuses any other object."""
-
-    @functools.wraps(make)
-    def updater(self: CustomLearner, system: System, rng: np.random.Generator) -> Updater:
-        found = make(self, system, rng)
-        check_returned(f"learner '{self.name}'", "updater", found, Updater)
-        return found
-
-    return updater
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -263,22 +263,6 @@ class GaussNewton(InformationLearner):
         return regularization, self.noise_variance, *fit
 
 
-class Renewal(NamedTuple):
-    """Part of the prior that is added back to M at each step while M fades.
-
-    Attributes
-    ----------
-    entries : int
-        Diagonal entries of M that are renewed at a step, k of them in turn: at step t those at
-        (k t, ..., k t + k - 1) mod q.
-    weight : float
-        Number that is added to each of them.
-    """
-
-    entries: int
-    weight: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class ExtendedKalman(InformationLearner):
     """θ += K e with K = M⁻¹Jᵀ (ρI + J M⁻¹ Jᵀ)⁻¹, and M += JᵀJ/ρ.
@@ -316,19 +300,20 @@ class ExtendedKalman(InformationLearner):
     forgetting: float = parameter(1.0, bound="share")
     underweighting: float = parameter(0.0, bound="nonnegative", added=True)
 
-    def renewal(self, n_parameters: int, regularization: float) -> Renewal:
-        """Return what is given back of λI for q parameters.
+    def renewal(self, n_parameters: int, regularization: float) -> tuple[int, float]:
+        """Return to how many diagonal entries of M, for q parameters, what is given back of λI.
 
+        They have k entries in turn: at step t those at (k t, ..., k t + k - 1) mod q.
         All entries have their turn within a period P with fᴾ ≥ 1/2, or at each step if f is less.
         With an entry at λ or above after its turn it is at fᴾλ or above before the next, to which
         λ(1 - fᴾ) is added.
         """
         if self.forgetting == 1.0:
-            return Renewal(0, 0.0)
+            return 0, 0.0
         longest = max(1, math.floor(math.log(0.5) / math.log(self.forgetting)))
         entries = math.ceil(n_parameters / longest)
         period = math.ceil(n_parameters / entries)
-        return Renewal(entries, regularization * (1.0 - self.forgetting**period))
+        return entries, regularization * (1.0 - self.forgetting**period)
 
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:
         entries, weight = self.renewal(n_parameters, regularization)

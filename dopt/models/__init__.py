@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from dopt.models.base import MLP, AffineMLP, BlackBoxMLP, Ensemble, Model
-from dopt.models.gaussian_process import GaussianProcess
-from dopt.models.linear import RFF, GreyBox, Linear, LinearState
+from dopt.models.base import MLP as MLP
+from dopt.models.base import AffineMLP as AffineMLP
+from dopt.models.base import BlackBoxMLP as BlackBoxMLP
+from dopt.models.base import Ensemble as Ensemble
+from dopt.models.base import Model as Model
+from dopt.models.gaussian_process import GaussianProcess as GaussianProcess
+from dopt.models.linear import RFF as RFF
+from dopt.models.linear import GreyBox as GreyBox
+from dopt.models.linear import Linear as Linear
+from dopt.models.linear import LinearState as LinearState
 
 MODELS: dict[str, type[Model]] = {
     model.name: model
@@ -20,17 +27,3 @@ MODELS: dict[str, type[Model]] = {
         GreyBox,
     )
 }
-
-__all__ = [
-    "MLP",
-    "MODELS",
-    "RFF",
-    "AffineMLP",
-    "BlackBoxMLP",
-    "Ensemble",
-    "GaussianProcess",
-    "GreyBox",
-    "Linear",
-    "LinearState",
-    "Model",
-]

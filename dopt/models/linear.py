@@ -36,12 +36,17 @@ class Linear(Model):
         return system.n_inputs if system.reads_inputs else 0
 
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
-        offset, *units = (
-            np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.T), form)), axis=-1)
-            for form in system.linear_form
-        )
-        regressors = np.stack([unit - offset for unit in units], axis=-1)
+        offset, regressors = linear_terms(system, points)
         return offset + regressors @ parameters
+
+
+def linear_terms(system: System, points: Array) -> tuple[Array, Array]:
+    """Return offset, (N, r), and Ψ, (N, r, q), of the linear form at points (N, d or d + m)."""
+    offset, *units = (
+        np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.T), form)), axis=-1)
+        for form in system.linear_form
+    )
+    return offset, np.stack([unit - offset for unit in units], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from dopt.control.task import Control, Feedback, Goal
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.fields import PLAN_IN_NUMPY, KernelPart, parameter
+from dopt.fields import IN_NUMPY, KernelPart, parameter
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 from dopt.types import Array as Array
@@ -109,12 +109,12 @@ class InformationPolicy(ClosedLoop):
     information: str = parameter("accumulated", choices=("accumulated", "fresh"), added=True)
     refresh_every: int = parameter(1, "steps", "positive", added=True)
 
-    @abstractmethod
-    def chosen_form(self, n_parameters: int, n_rows: int) -> str:
+    def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # of most, one
         """Return how M is held for q parameters and N rows in the whole trial.
 
         It is "primal", "dual" or "sketch" (:class:`dopt.policies.d_optimal.DOptimal`).
         """
+        return "primal"
 
 
 class Planner(ABC):
@@ -147,7 +147,7 @@ class CustomPolicy(ClosedLoop):
     """
 
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = PLAN_IN_NUMPY
+    kernel_function: ClassVar[str] = IN_NUMPY
 
     @abstractmethod
     def planner(self, system: System, rng: np.random.Generator) -> Planner:

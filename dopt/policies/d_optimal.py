@@ -59,9 +59,10 @@ class DOptimal(InformationPolicy):
 
     form: str = parameter("auto", choices=("auto", "primal", "dual", "sketch"))
     sketch_size: int = parameter(256, "dimensions", "positive")
+    all_components: ClassVar[bool] = False
 
-    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of a component drawn at each step
-        return (0.0,)
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of no use here
+        return (float(self.all_components),)
 
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:
         """Return the form for q parameters and N rows in the whole trial.
@@ -96,9 +97,7 @@ class TraceLinearized(DOptimal):
 
     name: ClassVar[str] = "trace_linearized"
     compiled: ClassVar[bool] = True
-
-    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of all components
-        return (1.0,)
+    all_components: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,9 +160,6 @@ class GradientDOptimal(CandidatePolicy, InformationPolicy, CustomPolicy):
 
     starts: int = parameter(2, "inputs", "positive")
     iterations: int = parameter(4, "steps", "positive")
-
-    def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
-        return "primal"
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002  # nothing is random here
         return GradientPlan(self, system)

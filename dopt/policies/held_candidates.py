@@ -47,6 +47,10 @@ class HeldCandidates(CandidatePolicy, ClosedLoop):
     def check(self, system: System) -> None:
         check_length("policy.lookahead", self.lookahead, system)
 
+    def steps(self, system: System) -> int:
+        """Return the number of steps H of a plan."""
+        return self.lookahead + system.lead_steps
+
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianProcessEntropy(HeldCandidates):
@@ -120,7 +124,7 @@ class DisagreementPlan(Planner):
         rng: np.random.Generator,
     ) -> None:
         self._system, self._networks = system, networks
-        self._steps = policy.lookahead + system.lead_steps
+        self._steps = policy.steps(system)
         self._inputs = policy.compared_inputs(system)
         draw = functools.partial(networks.model.initial_parameters, system, rng)
         self._others = np.array([draw() for _ in range(policy.ensemble - 1)])
@@ -143,10 +147,10 @@ class DisagreementPlan(Planner):
 
     def _rate(self, members: Array, states: Array) -> Array:
         """Return dx/dt by the mean of the networks, (C, d), at a state for each candidate."""
-        system = self._system
-        known = system.known(tuple(states.T), tuple(self._inputs.T), system.parameters)
-        rate = np.stack(np.broadcast_arrays(*known, states[:, 0])[:-1], axis=-1)
-        rate[:, list(system.learned_rows)] += self._networks.predict(members, states).mean(axis=0)
+        rate = self._system.known_flow(states, self._inputs)
+        rate[:, list(self._system.learned_rows)] += self._networks.predict(members, states).mean(
+            axis=0
+        )
         return rate
 
     def observe(self, view: TrialView) -> None:
@@ -271,7 +275,7 @@ class SpaceFillingPlan(Planner):
 
     def worth(self, view: TrialView, inputs: Array) -> Array:
         """Return what each of some inputs, (C, m), is worth, (C,)."""
-        reached = view.held(inputs, self._policy.lookahead + view.system.lead_steps)
+        reached = view.held(inputs, self._policy.steps(view.system))
         points = view.points(reached, inputs)
         samples = view.points(view.sampled, view.sampled_inputs)
         apart = _squared_distances(self._features(points), self._features(samples))

@@ -59,8 +59,7 @@ class RandomHeld(OpenLoop):
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         draws = rng.standard_normal((-(-system.horizon // self.hold), system.n_inputs))
-        held = np.repeat(on_sphere(draws, system.gamma), self.hold, axis=0)
-        return np.ascontiguousarray(held[: system.horizon])
+        return np.repeat(on_sphere(draws, system.gamma), self.hold, axis=0)[: system.horizon]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,8 +176,9 @@ class PRBS(OpenLoop):
         signs = 2.0 * bits - 1.0
         starts = rng.integers(len(signs)) + np.arange(m) * len(signs) // m
         sequence = signs[(np.arange(clocks)[:, None] + starts) % len(signs)]
-        held = np.repeat(system.gamma / math.sqrt(m) * sequence, self.hold, axis=0)
-        return np.ascontiguousarray(held[: system.horizon])
+        return np.repeat(system.gamma / math.sqrt(m) * sequence, self.hold, axis=0)[
+            : system.horizon
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.algorithm import Score
-from dopt.errors import IncompatibleError, SpecificationError, unknown_name
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.fields import parameter
 from dopt.policies.base import Array, InformationPolicy, Policy, check_length, on_sphere
 from dopt.systems.base import System
@@ -103,10 +103,6 @@ class CandidatePolicy(Policy):
         return system.gamma * sphere_directions(system.n_inputs, self.candidates)
 
 
-SCORES = {score.name.lower(): score for score in Score}
-"""Scores by which plans are compared."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Search(CandidatePolicy, InformationPolicy):
     """Roll the learned model along every plan of a finite set and take the best plan's first input.
@@ -138,28 +134,12 @@ class Search(CandidatePolicy, InformationPolicy):
 
     @property
     @abstractmethod
-    def score(self) -> str:
-        """Criterion of a plan, one of ``SCORES``."""
+    def score(self) -> Score:
+        """Criterion of a plan."""
 
     def steps(self, system: System) -> int:
         """Return the number of steps H of a plan: one in which the input acts."""
         return 1 + system.lead_steps
-
-    def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
-        return "primal"
-
-
-def score_code(policy: Search) -> Score:
-    """Return the code of a policy's score.
-
-    Raises
-    ------
-    SpecificationError
-        If there is no such score.
-    """
-    if policy.score not in SCORES:
-        raise unknown_name(f"score of policy '{policy.name}'", policy.score, SCORES)
-    return SCORES[policy.score]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +153,7 @@ class Exact(Search):
 
     name: ClassVar[str] = "exact"
     compiled: ClassVar[bool] = True
-    score: ClassVar[str] = "joint"
+    score: ClassVar[Score] = Score.JOINT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +166,7 @@ class Trace(Search):
 
     name: ClassVar[str] = "trace"
     compiled: ClassVar[bool] = True
-    score: ClassVar[str] = "trace"
+    score: ClassVar[Score] = Score.TRACE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +179,7 @@ class AOptimal(Search):
 
     name: ClassVar[str] = "a_optimal"
     compiled: ClassVar[bool] = True
-    score: ClassVar[str] = "a"
+    score: ClassVar[Score] = Score.A
 
 
 _START_SEED = 1_712
@@ -223,7 +203,7 @@ class EOptimal(Search):
 
     name: ClassVar[str] = "e_optimal"
     compiled: ClassVar[bool] = True
-    score: ClassVar[str] = "e"
+    score: ClassVar[Score] = Score.E
 
     subspace: int = parameter(32, "dimensions", "positive")
 
@@ -258,7 +238,7 @@ class TaskOptimal(Search):
 
     name: ClassVar[str] = "task"
     compiled: ClassVar[bool] = True
-    score: ClassVar[str] = "task"
+    score: ClassVar[Score] = Score.TASK
 
     states: str = parameter("grid", choices=("grid", "reachable"))
     count: int = parameter(32, "states", "positive")
@@ -323,8 +303,8 @@ class Lookahead(Search):
             )
 
     @property
-    def score(self) -> str:
-        return self.criterion
+    def score(self) -> Score:
+        return Score[self.criterion.upper()]
 
     def steps(self, system: System) -> int:
         if self.lookahead is not None:
@@ -438,13 +418,6 @@ class ICEM(InformationPolicy):
         """Number of states of the evaluation box at each step, 0 where the criterion needs none."""
         return self.count if self.criterion == "task" else 0
 
-    def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
-        return "primal"
-
-    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
-        sizes = (self.lookahead, self.hold, self.stride, self.plans, self.iterations, self.elites)
-        return tuple(float(number) for number in (*sizes, self.score, self.task_count))
-
     def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of the plans alone
         return (1 + self.elites) * self.segments * system.n_inputs
 
@@ -493,7 +466,3 @@ class Episodic(ICEM):
                 f"policy.replan_every is {self.replan_every} steps, but the plans have "
                 f"{self.lookahead}: make it smaller, or policy.lookahead larger."
             )
-
-    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:
-        numbers = super().kernel_numbers(n_parameters, regularization)
-        return *numbers, float(self.replan_every)

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dopt.control.task import Feedback
-from dopt.custom_planner import custom_planner
+from dopt.custom_planner import custom_planner, custom_updater
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.learning import Adam
@@ -23,7 +23,7 @@ from dopt.learning.base import CustomLearner, check_update
 from dopt.policies import DOptimal, InformationPolicy, Uniform
 from dopt.policies.base import OpenLoop, check_choice
 from dopt.policies.d_optimal import count_sketch
-from dopt.randomness import draw, episode_seed, stream
+from dopt.randomness import draw, episode_seed
 from dopt.reference.models import (
     BatchInformation,
     BatchModel,
@@ -41,7 +41,6 @@ from dopt.reference.models import (
     uniform_inputs,
 )
 from dopt.result import TrialResult
-from dopt.spec.compatibility import held_information
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import next_state
 from dopt.systems.black_box import BlackBox, new_start
@@ -112,7 +111,7 @@ class BatchSteps:
         if isinstance(learner, Adam):
             self.learner = AdamLearner(learner, self)
         elif isinstance(learner, CustomLearner):
-            self.learner = NumpyLearner(learner, self)
+            self.learner = NumpyLearner(self)
         else:
             ridge = getattr(policy, "regularization", getattr(learner, "regularization", 1.0))
             self.learner = LeastSquaresLearner(float(ridge), self)
@@ -136,8 +135,7 @@ class BatchSteps:
 
     def _hold_information(self) -> None:
         policy, q = self.config.policy, self.theta.shape[1]
-        n_rows = self.system.n_learned * self.system.horizon
-        held = held_information(policy, self.config.learner, q, n_rows)
+        held = self.config.information
         self._sketch: Tensor | None = None
         self.information: BatchInformation | None = None
         if held is None or not isinstance(policy, InformationPolicy):
@@ -337,11 +335,9 @@ class LeastSquaresLearner:
 class NumpyLearner:
     """The updates of a learner that is written in numpy, one trial after the other."""
 
-    def __init__(self, learner: CustomLearner, batch: BatchSteps) -> None:
-        self._batch = batch
-        self._updaters = [
-            learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
-        ]
+    def __init__(self, batch: BatchSteps) -> None:
+        self._batch, updaters = batch, map(custom_updater, batch.specs)
+        self._updaters = [updater for updater in updaters if updater is not None]
 
     def learn(self, t: int) -> None:
         """Write the parameters that the updates return after step t.
@@ -417,26 +413,23 @@ class Lockstep(BatchSteps):
 
     def step(self, t: int) -> None:
         """Take step t of every trial and record it."""
-        clocks = [self._clock()]
-        u = self.plan(t)
-        clocks.append(self._clock())
+        u, planned = self._timed(self.plan, t)
         self.act(t, u)
         inside = self.states[:, t + 1].abs() <= self.system.state_limit
         self.diverged |= ~inside.all(dim=1, keepdim=True)
-        clocks.append(self._clock())
-        self.learn(t)
-        clocks.append(self._clock())
-        self.inform(t)
-        clocks.append(self._clock())
-        loss, reachable = self.evaluate(t)
+        _, learned = self._timed(self.learn, t)
+        _, informed = self._timed(self.inform, t)
+        (loss, reachable), evaluated = self._timed(self.evaluate, t)
         self.diverged |= ~loss.isfinite().unsqueeze(1)
-        clocks.append(self._clock())
-        planned, _, learned, informed, evaluated = np.diff(clocks) * 1e6 / len(self.specs)
-        self.columns["loss"][:, t] = loss.cpu().numpy()
-        self.columns["reachable_loss"][:, t] = reachable.cpu().numpy()
-        self.columns["plan_us"][:, t] = planned + informed
-        self.columns["learn_us"][:, t] = learned
-        self.columns["evaluate_us"][:, t] = evaluated
+        losses = loss.cpu().numpy(), reachable.cpu().numpy()
+        values = (*losses, planned + informed, learned, evaluated)
+        for name, value in zip(COLUMNS, values, strict=True):
+            self.columns[name][:, t] = value
+
+    def _timed(self, function: Callable[..., Any], *given: Any) -> tuple[Any, float]:
+        """Return what a function gives, and the time that it takes for each trial [µs]."""
+        start, found = self._clock(), function(*given)
+        return found, 1e6 * (self._clock() - start) / len(self.specs)
 
     def _clock(self) -> float:
         if self.device != "cpu":

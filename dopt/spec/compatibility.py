@@ -14,6 +14,7 @@ import functools
 import math
 from typing import NamedTuple, TypeGuard
 
+from dopt.algorithm import Score
 from dopt.errors import IncompatibleError
 from dopt.learning import (
     LEARNERS,
@@ -69,9 +70,9 @@ class Information(NamedTuple):
 
 
 def held_information(
-    policy: Policy, learner: Learner, n_parameters: int, n_rows: int
+    system: System, policy: Policy, model: Model, learner: Learner
 ) -> Information | None:
-    """Return what M a trial holds for q parameters and N rows; None where nothing needs one.
+    """Return what M a trial holds; None where nothing needs one.
 
     A policy that plans by M shares it with a learner that updates it, which needs the gain in the
     space of the parameters and hence the primal form.
@@ -81,7 +82,8 @@ def held_information(
     sharing = learner if isinstance(learner, (InformationLearner, RecursiveLeastSquares)) else None
     noise_variance = sharing.noise_variance if isinstance(sharing, InformationLearner) else 1.0
     if isinstance(policy, InformationPolicy):
-        form = "primal" if sharing else policy.chosen_form(n_parameters, n_rows)
+        sizes = model.n_member_parameters(system), system.n_learned * system.horizon
+        form = "primal" if sharing else policy.chosen_form(*sizes)
         return Information(form, policy.regularization, noise_variance)
     if sharing is None:
         return None
@@ -193,7 +195,7 @@ def _check_sensors(system: System, learner: Learner) -> None:
         if not learner.estimates_states:
             raise mismatch("env.output_matrix", "learner 'joint_ekf'", f"learner '{learner.name}'")
         return
-    own = differentiated(system)[: system.n_states - system.n_carried]
+    own = differentiated(system)[0][: system.n_states - system.n_carried]
     unknown = [i for i, position in enumerate(own) if position < 0]
     if unknown and not learner.estimates_states:
         names = ", ".join(system.state_labels[i] for i in unknown)
@@ -249,16 +251,16 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if isinstance(policy, InformationPolicy):
         _check_information(system, policy, model, learner)
     if model.structure == "conditioning" and isinstance(policy, InformationPolicy):
-        score = getattr(policy, "score", None)  # a name, or its code
-        name = str(getattr(score, "name", score)).lower()
-        if name not in ("joint", "sum", "trace"):
+        score: Score | None = getattr(policy, "score", None)
+        if score not in (Score.JOINT, Score.SUM, Score.TRACE):
             expected = (
                 "a policy without an information matrix of parameters, or one that compares "
                 "plans by 'joint', 'sum' or 'variance' ('exact', 'trace', 'lookahead', 'icem', "
                 "'episodic')"
             )
-            shown = given if score is None else f"{given} with the criterion '{name}'"
-            raise mismatch(f"model '{model.name}'", expected, shown)
+            if score is not None:
+                given = f"{given} with the criterion '{score.name.lower()}'"
+            raise mismatch(f"model '{model.name}'", expected, given)
 
 
 def _check_unknown(system: System, model: GreyBox) -> None:
@@ -294,9 +296,8 @@ def _check_inputs(system: System, policy: Policy, model: Model, learner: Learner
             expected = "a model of the state alone, such as 'mlp'"
             raise mismatch(f"{part.section} '{part.name}'", expected, f"model '{model.name}'")
     form = getattr(policy, "form", "auto")
-    q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
     if isinstance(model, AffineMLP) and isinstance(policy, InformationPolicy):
-        held = held_information(policy, learner, q, n_rows)
+        held = held_information(system, policy, model, learner)
         if held and held.form == "dual":
             expected = "policy.form 'primal' or 'sketch'"
             chosen = "policy.form 'auto', which takes 'dual' here," if form == "auto" else None
@@ -385,7 +386,7 @@ def _matrices(
 ) -> dict[str, int]:
     """Return the numbers of the information matrix, of JᵀJ, and of the rows J of both."""
     T, r, q = system.horizon, system.n_learned, model.n_member_parameters(system)
-    held = held_information(policy, learner, q, r * T)
+    held = held_information(system, policy, model, learner)
     form = held.form if held else "none"
     if isinstance(model, GaussianProcess):
         C, G = model.room(system), r if model.is_tuned else 1

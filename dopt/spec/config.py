@@ -37,6 +37,7 @@ from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolic
 from dopt.policies.d_optimal import EQUAL_COST
 from dopt.registry import SOURCE, TARGET, added_defaults, identifying_section, section_of
 from dopt.spec.compatibility import (
+    Information,
     check_reference,
     check_sampled,
     check_together,
@@ -233,6 +234,11 @@ class TrialConfig:
         model = GaussianProcess(hyperparameters="evidence")
         return TrialConfig(self.system, RandomGaussian(), model, Conditioning())
 
+    @functools.cached_property
+    def information(self) -> Information | None:
+        """The one information matrix M of a trial; None where nothing needs it."""
+        return held_information(*self._parts)
+
     @property
     def _parts(self) -> tuple[System, Policy, Model, Learner]:
         return self.system, self.policy, self.model, self.learner
@@ -302,12 +308,11 @@ class TrialConfig:
 
     def _leaves_primal(self) -> bool:
         """Return True if M is sketched because the primal form, the cheapest, is too large."""
-        system, policy, model, learner = self._parts
-        if not isinstance(policy, DOptimal) or policy.form != "auto":
+        if not isinstance(self.policy, DOptimal) or self.policy.form != "auto":
             return False
-        q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
-        held = held_information(policy, learner, q, n_rows)
-        return bool(held and held.form == "sketch" and q <= EQUAL_COST * n_rows)
+        q = self.model.n_member_parameters(self.system)
+        sketched = bool(self.information and self.information.form == "sketch")
+        return sketched and q <= EQUAL_COST * self.system.n_learned * self.system.horizon
 
     @functools.cached_property
     def key(self) -> str:

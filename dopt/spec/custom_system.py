@@ -312,6 +312,11 @@ def _check_indices(system: System) -> None:
                 f"features of env '{name}' hold {feature!r}, but entries like "
                 f"Feature('cos', 0) are expected: make it a dopt.systems.Feature."
             )
+        if feature.kind not in KINDS:
+            raise SpecificationError(
+                f"features of env '{name}' hold one of kind '{feature.kind}', but the kinds are "
+                f"{', '.join(KINDS)}: take one of them."
+            )
     declared = {
         "learned_rows": system.learned_rows,
         "grid_indices": system.grid_indices,
@@ -331,12 +336,6 @@ def _check_indices(system: System) -> None:
             f"learned_rows of env '{name}' are {system.learned_rows}, but no row twice is "
             f"expected: name each learned row of the state derivative once."
         )
-    for feature in system.features:
-        if feature.kind not in KINDS:
-            raise SpecificationError(
-                f"features of env '{name}' hold one of kind '{feature.kind}', but the kinds are "
-                f"{', '.join(KINDS)}: take one of them."
-            )
 
 
 def _try(system: System, what: str, size: int, *arguments: Sequence[Any]) -> None:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.errors import SpecificationError
-from dopt.fields import Validated, parameter
-from dopt.systems.base import Feature, System
+from dopt.fields import parameter
+from dopt.systems.base import Feature, Repeated, System, identity, turn
 from dopt.systems.elementary import cos, sin
 from dopt.types import Scalar
 
@@ -63,14 +62,7 @@ class Arm(System):
     state_labels: ClassVar[tuple[str, ...]] = ("φ₁ [rad]", "φ̇₁ [rad/s]", "φ₂ [rad]", "φ̇₂ [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u₁ [N m]", "u₂ [N m]")
     learned_rows: ClassVar[tuple[int, ...]] = (1, 3)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("cos", 0),
-        Feature("sin", 0),
-        Feature("identity", 1),
-        Feature("cos", 2),
-        Feature("sin", 2),
-        Feature("identity", 3),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*turn(0), *identity(1), *turn(2), *identity(3))
     angle_indices: ClassVar[tuple[int, ...]] = (0, 2)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
@@ -130,30 +122,8 @@ def _solved_chain(state: Scalar, parameters: Scalar, right: list[Scalar]) -> lis
     return solution
 
 
-def _learned_rows(n_links: int) -> tuple[int, ...]:
-    return tuple(range(1, 2 * n_links, 2))
-
-
-def _state_labels(n_links: int) -> tuple[str, ...]:
-    return tuple(label for i in range(1, n_links + 1) for label in (f"φ{i} [rad]", f"φ̇{i} [rad/s]"))
-
-
-def _features(n_links: int) -> tuple[Feature, ...]:
-    return tuple(
-        feature
-        for i in range(0, 2 * n_links, 2)
-        for feature in (Feature("cos", i), Feature("sin", i), Feature("identity", i + 1))
-    )
-
-
-LARGEST_CHAIN = 100
-"""Links of a chain; its mass matrix is solved without a thought for its structure."""
-
-_DEFAULT_LINKS = 5
-
-
 @dataclass(frozen=True, kw_only=True)
-class Chain(System):
+class Chain(Repeated):
     """Chain of n massless links of length l with a mass m at the end of each, damped by its medium.
 
     State: φ₁, φ̇₁, …, φₙ, φ̇ₙ, absolute angles from hanging [rad] and rates [rad/s]. Inputs: the
@@ -165,7 +135,7 @@ class Chain(System):
     Learned: all φ̈ᵢ at τ = 0. Known: H⁻¹ times the torques.
 
     The evaluation box has 2n axes, too many for a full grid: its points are a low-discrepancy set
-    of ``grid_points`` states. The attributes of the class belong to the default number of links.
+    of ``grid_points`` states.
 
     Parameters
     ----------
@@ -202,19 +172,13 @@ class Chain(System):
     name: ClassVar[str] = "chain"
     physical: ClassVar[tuple[str, ...]] = ("mass", "length", "gravity", "friction")
     linear_parameters: ClassVar[tuple[str, ...]] = ("gravity", "friction")
-    state_labels: ClassVar[tuple[str, ...]] = _state_labels(_DEFAULT_LINKS)
-    input_labels: ClassVar[tuple[str, ...]] = tuple(
-        f"τ{i} [N m]" for i in range(1, _DEFAULT_LINKS + 1)
-    )
-    learned_rows: ClassVar[tuple[int, ...]] = _learned_rows(_DEFAULT_LINKS)
-    features: ClassVar[tuple[Feature, ...]] = _features(_DEFAULT_LINKS)
-    angle_indices: ClassVar[tuple[int, ...]] = tuple(range(0, 2 * _DEFAULT_LINKS, 2))
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
-    grid_indices: ClassVar[tuple[int, ...]] = tuple(range(2 * _DEFAULT_LINKS))
     low_discrepancy: ClassVar[bool] = True
-    equilibrium: ClassVar[tuple[float, ...] | None] = (0.0,) * (2 * _DEFAULT_LINKS)
+    counted: ClassVar[str] = "n_links"
+    most: ClassVar[int] = 100  # its mass matrix is solved without a thought for its structure
+    repeated: ClassVar[dict[str, int]] = {"initial_state": 2, "grid_half_widths": 2}
 
-    n_links: int = parameter(_DEFAULT_LINKS, "links", "positive")
+    n_links: int = parameter(5, "links", "positive")
     mass: float = parameter(0.2, "kg", "positive")
     length: float = parameter(0.4, "m", "positive")
     gravity: float = parameter(10.0, "m/s²", "nonnegative")
@@ -224,33 +188,18 @@ class Chain(System):
     grid_half_widths: tuple[float, ...] = parameter((1.0, 6.0), bound="positive")
     grid_points: tuple[int, ...] = parameter((1024,), bound="positive")
 
-    def __post_init__(self) -> None:
-        Validated.__post_init__(self)
-        if self.n_links > LARGEST_CHAIN:
-            raise SpecificationError(
-                f"env.n_links is {self.n_links}, but it has to be at most {LARGEST_CHAIN}: "
-                f"set env.n_links to a smaller number."
-            )
-        self._take_shape(self.n_links)
-        super().__post_init__()
-
-    def _take_shape(self, n: int) -> None:
-        """Set what follows from the number of links, and say for every link what is said once."""
-        shape = {
-            "state_labels": _state_labels(n),
-            "input_labels": tuple(f"τ{i} [N m]" for i in range(1, n + 1)),
-            "learned_rows": _learned_rows(n),
-            "features": _features(n),
-            "angle_indices": tuple(range(0, 2 * n, 2)),
+    @staticmethod
+    def shape(n: int) -> dict[str, tuple[object, ...]]:
+        links, angles = range(1, n + 1), range(0, 2 * n, 2)
+        return {
+            "state_labels": tuple(x for i in links for x in (f"φ{i} [rad]", f"φ̇{i} [rad/s]")),
+            "input_labels": tuple(f"τ{i} [N m]" for i in links),
+            "learned_rows": tuple(range(1, 2 * n, 2)),
+            "features": tuple(one for i in angles for one in (*turn(i), *identity(i + 1))),
+            "angle_indices": tuple(angles),
             "grid_indices": tuple(range(2 * n)),
             "equilibrium": (0.0,) * (2 * n),
         }
-        for field in ("initial_state", "grid_half_widths"):
-            given = getattr(self, field)
-            if len(given) % 2 == 0 and given == given[:2] * (len(given) // 2):
-                shape[field] = given[:2] * n
-        for attribute, value in shape.items():
-            object.__setattr__(self, attribute, value)
 
     @staticmethod
     def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> Sequence[Scalar]:

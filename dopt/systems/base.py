@@ -107,6 +107,16 @@ class Feature:
     index: int
 
 
+def identity(*indices: int) -> tuple[Feature, ...]:
+    """Return components of the state as features."""
+    return tuple(Feature("identity", index) for index in indices)
+
+
+def turn(index: int) -> tuple[Feature, Feature]:
+    """Return cosine and sine of an angle as features."""
+    return Feature("cos", index), Feature("sin", index)
+
+
 def feature_values(
     features: tuple[Feature, ...], scales: tuple[float, ...], state: Scalar
 ) -> list[Scalar]:
@@ -365,6 +375,20 @@ class System(Validated):
         flow[list(self.learned_rows)] += rows
         return flow
 
+    def known_flow(self, states: Array, inputs: Array) -> Array:
+        """Return the known part of dx/dt, (N, d), at states (N, d) under inputs (N, m)."""
+        known = self.known(tuple(states.T), tuple(inputs.T), self.parameters)
+        return np.stack(np.broadcast_arrays(*known, states[:, 0])[:-1], axis=-1)
+
+    def observed(self, states: Array, inputs: Array) -> Array:
+        """Return the accelerations, (T, r), seen between states (T + 1, d) under (T, m)."""
+        return self.less_known(np.diff(states, axis=0), self.sampled_states(states), inputs)
+
+    def less_known(self, changes: Array, at: Array, inputs: Array) -> Array:
+        """Return the learned part, (N, r), of changes in a step, (N, d), at (N, d) and (N, m)."""
+        learned: Array = changes / self.dt - self.known_flow(at, inputs)
+        return learned[:, list(self.learned_rows)]
+
     def sampled_states(self, states: Array) -> Array:
         """Return the states, (T, d), at which the accelerations between (T + 1, d) are observed.
 
@@ -396,3 +420,44 @@ def with_inputs(states: Array, inputs: Array | None, n_inputs: int) -> Array:
     if inputs is None:
         inputs = np.zeros((len(states), n_inputs))
     return np.concatenate([states, inputs], axis=-1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Repeated(System):
+    """A system of n equal parts, from whose number its attributes follow.
+
+    ``counted`` names the field n, and ``most`` is the largest n. A field of ``repeated`` that has
+    the numbers of one part, so many, has them for each. The attributes of the class belong to the
+    default n.
+    """
+
+    counted: ClassVar[str]
+    most: ClassVar[int]
+    repeated: ClassVar[dict[str, int]]
+
+    @staticmethod
+    @abstractmethod
+    def shape(n: int) -> dict[str, tuple[object, ...]]:
+        """Return what follows from the number of parts, by attribute."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        default = getattr(cls, cls.counted)
+        for attribute, value in cls.shape(getattr(default, "default", default)).items():
+            setattr(cls, attribute, value)
+
+    def __post_init__(self) -> None:
+        Validated.__post_init__(self)
+        n = getattr(self, self.counted)
+        if n > self.most:
+            raise SpecificationError(
+                f"env.{self.counted} is {n}, but it has to be at most {self.most}: set "
+                f"env.{self.counted} to a smaller number."
+            )
+        for attribute, value in self.shape(n).items():
+            object.__setattr__(self, attribute, value)
+        for field, size in self.repeated.items():
+            given = getattr(self, field)
+            if given == given[:size] * (len(given) // size):
+                object.__setattr__(self, field, given[:size] * n)
+        super().__post_init__()

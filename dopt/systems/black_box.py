@@ -127,17 +127,6 @@ class BlackBox(System):
             "another env."
         )
 
-    def observed(self, states: Array, inputs: Array) -> Array:
-        """Return the accelerations, (T, r), seen between states (T + 1, d) under (T, m)."""
-        return self._less_known(states[1:] - states[:-1], self.sampled_states(states), inputs)
-
-    def _less_known(self, changes: Array, at: Array, inputs: Array) -> Array:
-        """Return the learned part, (N, r), of changes in a step, (N, d), at (N, d) and (N, m)."""
-        known = self.known(tuple(at.T), tuple(inputs.T), self.parameters)
-        flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-        learned: Array = changes / self.dt - flow
-        return learned[:, list(self.learned_rows)]
-
 
 def check_step(system: BlackBox, seconds: float, model: str) -> None:
     """Raise SpecificationError if a step of what runs, with some name, takes another time."""
@@ -204,39 +193,28 @@ TRIED = 16
 _SEED = 20_261_123
 
 
-def differentiated(system: System) -> list[int]:
-    """Return for each state the measured one whose difference estimates it, itself if measured.
+def differentiated(system: System) -> tuple[list[int], list[float]]:
+    """Return for each state the measured one whose difference estimates it, and its factor.
 
-    It is -1 for a state that is neither measured nor proportional to the rate of a measured state,
-    all of which is known.
+    The state is itself with the factor 1 if it is measured, and -1 if it is neither measured nor
+    proportional to the rate of a measured state, all of which is known. The factor is that rate in
+    units of the state that it estimates.
     """
-    return [of for of, _ in _sources(system)]
-
-
-def rate_factors(system: System) -> list[float]:
-    """Return what the rate of a measured state is, in units of the state that it estimates."""
-    return [factor for _, factor in _sources(system)]
-
-
-def _sources(system: System) -> list[tuple[int, float]]:
-    """Return the measured state that estimates each state, -1 without one, and its factor."""
     rng = np.random.default_rng(_SEED)
     states = rng.uniform(-1.0, 1.0, (system.n_states, TRIED))
     inputs = rng.uniform(-1.0, 1.0, (system.n_inputs, TRIED))
     with np.errstate(all="ignore"):
-        flow = system.known(tuple(states), tuple(inputs), system.parameters)
-        rates = np.stack(np.broadcast_arrays(*flow, states[0])[:-1])
+        rates = system.known_flow(states.T, inputs.T).T
     kinematic = [i for i in system.measured_states if i not in system.learned_rows]
-    found = []
+    sources, found = list[int](), list[float]()
     for index, state in enumerate(states):
         factors = {i: float(rates[i][0] / state[0]) for i in kinematic}
         of = [i for i, c in factors.items() if c and np.allclose(rates[i], c * state, ROUNDING, 0)]
         of = sorted(of, key=lambda i: factors[i] != 1.0)
-        if index in system.measured_states or not of:
-            found.append((index if index in system.measured_states else -1, 1.0))
-        else:
-            found.append((of[0], factors[of[0]]))
-    return found
+        measured = index in system.measured_states
+        sources.append(index if measured else of[0] if of else -1)
+        found.append(factors[of[0]] if of and not measured else 1.0)
+    return sources, found
 
 
 def start_variances(system: System) -> Array:
@@ -254,7 +232,7 @@ def start_variances(system: System) -> Array:
 
 def delay(system: System) -> float:
     """Return by how many steps differences come after what they are the rates of."""
-    own = differentiated(system)[: system.n_states - system.n_carried]
+    own = differentiated(system)[0][: system.n_states - system.n_carried]
     if all(state == of for state, of in enumerate(own)):
         return 0.0
     simulated = system.integrator == "euler" and not isinstance(system, BlackBox)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dopt.fields import parameter
-from dopt.systems.base import Feature, System
+from dopt.systems.base import Feature, System, identity, turn
 from dopt.systems.elementary import cos, sin
 from dopt.types import Scalar
 
@@ -62,12 +62,7 @@ class Cartpole(System):
     state_labels: ClassVar[tuple[str, ...]] = ("y [m]", "ẏ [m/s]", "φ [rad]", "φ̇ [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [N]",)
     learned_rows: ClassVar[tuple[int, ...]] = (1, 3)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("identity", 1),
-        Feature("cos", 2),
-        Feature("sin", 2),
-        Feature("identity", 3),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*identity(1), *turn(2), *identity(3))
     angle_indices: ClassVar[tuple[int, ...]] = (2,)
     phase_plane: ClassVar[tuple[int, int]] = (2, 3)
     grid_indices: ClassVar[tuple[int, ...]] = (1, 2, 3)

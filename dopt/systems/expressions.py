@@ -20,15 +20,7 @@ from dopt.systems.properties import SPLIT
 from dopt.types import Equation
 
 FUNCTIONS = {
-    function.__name__: function
-    for function in (
-        elementary.sin,
-        elementary.cos,
-        elementary.tanh,
-        elementary.magnitude,
-        elementary.sign,
-        elementary.where,
-    )
+    name: getattr(elementary, name) for name in ("sin", "cos", "tanh", "magnitude", "sign", "where")
 }
 """Functions that an expression may call (:mod:`dopt.systems.elementary`)."""
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from dopt.errors import SpecificationError, install_command
 from dopt.fields import parameter
-from dopt.systems.base import Array, Feature
+from dopt.systems.base import Array, Feature, identity, turn
 from dopt.systems.black_box import BlackBox, Episode, check_amplitude, check_step
 from dopt.types import Scalar
 
@@ -99,7 +99,7 @@ class MuJoCo(BlackBox):
     def true_accelerations(self, states: Array, inputs: Array) -> Array:
         run = Run(_checked_model(self), np.array(self.start), self.rate_unit)
         following = [run.step_from(x, u) for x, u in zip(states, inputs, strict=True)]
-        return self._less_known(np.array(following) - states, states, inputs)
+        return self.less_known(np.array(following) - states, states, inputs)
 
 
 class Run:
@@ -228,11 +228,7 @@ class MuJoCoPendulum(SuiteModel):
     state_labels: ClassVar[tuple[str, ...]] = ("θ [rad]", "ω [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [N m]",)
     learned_rows: ClassVar[tuple[int, ...]] = (1,)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("cos", 0),
-        Feature("sin", 0),
-        Feature("identity", 1),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*turn(0), *identity(1))
     angle_indices: ClassVar[tuple[int, ...]] = (0,)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
@@ -274,13 +270,7 @@ class MuJoCoCartpole(SuiteModel):
     state_labels: ClassVar[tuple[str, ...]] = ("y [m]", "φ [rad]", "ẏ [m/s]", "φ̇ [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [10 N]",)
     learned_rows: ClassVar[tuple[int, ...]] = (2, 3)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("identity", 0),
-        Feature("cos", 1),
-        Feature("sin", 1),
-        Feature("identity", 2),
-        Feature("identity", 3),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*identity(0), *turn(1), *identity(2, 3))
     angle_indices: ClassVar[tuple[int, ...]] = (1,)
     phase_plane: ClassVar[tuple[int, int]] = (1, 3)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
@@ -316,14 +306,7 @@ class MuJoCoAcrobot(SuiteModel):
     state_labels: ClassVar[tuple[str, ...]] = ("θ₁ [rad]", "θ₂ [rad]", "ω₁ [rad/s]", "ω₂ [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [2 N m]",)
     learned_rows: ClassVar[tuple[int, ...]] = (2, 3)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("cos", 0),
-        Feature("sin", 0),
-        Feature("cos", 1),
-        Feature("sin", 1),
-        Feature("identity", 2),
-        Feature("identity", 3),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*turn(0), *turn(1), *identity(2, 3))
     angle_indices: ClassVar[tuple[int, ...]] = (0, 1)
     phase_plane: ClassVar[tuple[int, int]] = (0, 2)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
@@ -365,12 +348,7 @@ class MuJoCoReacher(SuiteModel):
     )
     input_labels: ClassVar[tuple[str, ...]] = ("u₁ [0.05 N m]", "u₂ [0.05 N m]")
     learned_rows: ClassVar[tuple[int, ...]] = (2, 3)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("cos", 1),
-        Feature("sin", 1),
-        Feature("identity", 2),
-        Feature("identity", 3),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*turn(1), *identity(2, 3))
     angle_indices: ClassVar[tuple[int, ...]] = (0, 1)
     phase_plane: ClassVar[tuple[int, int]] = (1, 3)
     grid_indices: ClassVar[tuple[int, ...]] = (1, 2, 3)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dopt.fields import parameter
-from dopt.systems.base import Feature, System
+from dopt.systems.base import Feature, System, identity
 from dopt.types import Scalar
 
 
@@ -47,7 +47,7 @@ class MassSpring(System):
     state_labels: ClassVar[tuple[str, ...]] = ("q₁ [m]", "q̇₁ [m/s]", "q₂ [m]", "q̇₂ [m/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u₁ [N]", "u₂ [N]")
     learned_rows: ClassVar[tuple[int, ...]] = (1, 3)
-    features: ClassVar[tuple[Feature, ...]] = tuple(Feature("identity", i) for i in range(4))
+    features: ClassVar[tuple[Feature, ...]] = identity(0, 1, 2, 3)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
     equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0, 0.0, 0.0)
@@ -115,7 +115,7 @@ class VanDerPol(System):
     state_labels: ClassVar[tuple[str, ...]] = ("q [m]", "v [m/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [m/s²]",)
     learned_rows: ClassVar[tuple[int, ...]] = (1,)
-    features: ClassVar[tuple[Feature, ...]] = (Feature("identity", 0), Feature("identity", 1))
+    features: ClassVar[tuple[Feature, ...]] = identity(0, 1)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
 

@@ -10,9 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.errors import SpecificationError
-from dopt.fields import Validated, parameter
-from dopt.systems.base import Array, Feature, System
+from dopt.fields import parameter
+from dopt.systems.base import Array, Feature, Repeated, System, identity, turn
 from dopt.systems.elementary import sin, tanh
 from dopt.types import Scalar
 
@@ -52,11 +51,7 @@ class Pendulum(System):
     state_labels: ClassVar[tuple[str, ...]] = ("φ [rad]", "φ̇ [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [N m]",)
     learned_rows: ClassVar[tuple[int, ...]] = (1,)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("cos", 0),
-        Feature("sin", 0),
-        Feature("identity", 1),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*turn(0), *identity(1))
     angle_indices: ClassVar[tuple[int, ...]] = (0,)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
@@ -204,11 +199,7 @@ class UnbalancedDisk(System):
     state_labels: ClassVar[tuple[str, ...]] = ("y [rad]", "ω [rad/s]")
     input_labels: ClassVar[tuple[str, ...]] = ("u [V]",)
     learned_rows: ClassVar[tuple[int, ...]] = (1,)
-    features: ClassVar[tuple[Feature, ...]] = (
-        Feature("cos", 0),
-        Feature("sin", 0),
-        Feature("identity", 1),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*turn(0), *identity(1))
     angle_indices: ClassVar[tuple[int, ...]] = (0,)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
@@ -236,35 +227,8 @@ class UnbalancedDisk(System):
         return (-gravity * sin(angle) - friction * rate - dry,)
 
 
-LARGEST_ROW = 50
-"""Pendulums of a row; each has a friction of its own, and the compiled equations hold them all."""
-
-_DEFAULT_PENDULUMS = 5
-
-
-def _shape(n: int) -> dict[str, tuple[object, ...]]:
-    """Return what follows from the number of pendulums."""
-    frictions = tuple(f"friction_{i}" for i in range(1, n + 1))
-    rates = tuple(range(1, 2 * n, 2))
-    return {
-        "physical": ("gravity", "coupling", *frictions),
-        "linear_parameters": frictions,
-        "state_labels": tuple(
-            label for i in range(1, n + 1) for label in (f"φ{i} [rad]", f"φ̇{i} [rad/s]")
-        ),
-        "learned_rows": rates,
-        "features": tuple(Feature("identity", i) for i in rates),
-        "angle_indices": tuple(range(0, 2 * n, 2)),
-        "grid_indices": rates,
-        "equilibrium": (0.0,) * (2 * n),
-    }
-
-
-_DEFAULT = _shape(_DEFAULT_PENDULUMS)
-
-
 @dataclass(frozen=True, kw_only=True)
-class CoupledPendulums(System):
+class CoupledPendulums(Repeated):
     """Row of n equal pendulums on one axis, each coupled to its neighbours by torsion springs.
 
     State: φ₁, φ̇₁, …, φₙ, φ̇ₙ, angles from hanging [rad] and rates [rad/s]. Input: the torque of
@@ -281,8 +245,7 @@ class CoupledPendulums(System):
     The evaluation box has an axis for each rate, and its points are a low-discrepancy set, whose
     projection on every axis is a regular partition: the loss of the linear model is the Euclidean
     norm of the error of the frictions times the root mean square of that partition
-    (:mod:`dopt.assessment`). The attributes of the class belong to the default number of
-    pendulums.
+    (:mod:`dopt.assessment`).
 
     Parameters
     ----------
@@ -314,19 +277,14 @@ class CoupledPendulums(System):
     """
 
     name: ClassVar[str] = "coupled_pendulums"
-    physical: ClassVar[tuple[str, ...]] = _DEFAULT["physical"]  # type: ignore[assignment]
-    linear_parameters: ClassVar[tuple[str, ...]] = _DEFAULT["linear_parameters"]  # type: ignore[assignment]
-    state_labels: ClassVar[tuple[str, ...]] = _DEFAULT["state_labels"]  # type: ignore[assignment]
     input_labels: ClassVar[tuple[str, ...]] = ("u [rad/s²]",)
-    learned_rows: ClassVar[tuple[int, ...]] = _DEFAULT["learned_rows"]  # type: ignore[assignment]
-    features: ClassVar[tuple[Feature, ...]] = _DEFAULT["features"]  # type: ignore[assignment]
-    angle_indices: ClassVar[tuple[int, ...]] = _DEFAULT["angle_indices"]  # type: ignore[assignment]
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
-    grid_indices: ClassVar[tuple[int, ...]] = _DEFAULT["grid_indices"]  # type: ignore[assignment]
     low_discrepancy: ClassVar[bool] = True
-    equilibrium: ClassVar[tuple[float, ...] | None] = _DEFAULT["equilibrium"]  # type: ignore[assignment]
+    counted: ClassVar[str] = "n_pendulums"
+    most: ClassVar[int] = 50  # each has its friction, and the compiled equations hold them all
+    repeated: ClassVar[dict[str, int]] = {"initial_state": 2, "grid_half_widths": 1}
 
-    n_pendulums: int = parameter(_DEFAULT_PENDULUMS, "pendulums", "positive")
+    n_pendulums: int = parameter(5, "pendulums", "positive")
     gravity: float = parameter(1.0, "rad/s²", "nonnegative")
     coupling: float = parameter(6.25, "1/s²", "nonnegative")
     friction: float = parameter(0.6, "1/s", "nonnegative")
@@ -336,21 +294,20 @@ class CoupledPendulums(System):
     grid_half_widths: tuple[float, ...] = parameter((3.0,), bound="positive")
     grid_points: tuple[int, ...] = parameter((64,), bound="positive")
 
-    def __post_init__(self) -> None:
-        Validated.__post_init__(self)
-        n = self.n_pendulums
-        if n > LARGEST_ROW:
-            raise SpecificationError(
-                f"env.n_pendulums is {n}, but it has to be at most {LARGEST_ROW}: set "
-                f"env.n_pendulums to a smaller number."
-            )
-        for attribute, value in _shape(n).items():
-            object.__setattr__(self, attribute, value)
-        for field, size in (("initial_state", 2), ("grid_half_widths", 1)):
-            given = getattr(self, field)
-            if len(given) % size == 0 and given == given[:size] * (len(given) // size):
-                object.__setattr__(self, field, given[:size] * n)
-        super().__post_init__()
+    @staticmethod
+    def shape(n: int) -> dict[str, tuple[object, ...]]:
+        pendulums, rates = range(1, n + 1), range(1, 2 * n, 2)
+        frictions = tuple(f"friction_{i}" for i in pendulums)
+        return {
+            "physical": ("gravity", "coupling", *frictions),
+            "linear_parameters": frictions,
+            "state_labels": tuple(x for i in pendulums for x in (f"φ{i} [rad]", f"φ̇{i} [rad/s]")),
+            "learned_rows": tuple(rates),
+            "features": identity(*rates),
+            "angle_indices": tuple(range(0, 2 * n, 2)),
+            "grid_indices": tuple(rates),
+            "equilibrium": (0.0,) * (2 * n),
+        }
 
     @property
     def parameters(self) -> tuple[float, ...]:

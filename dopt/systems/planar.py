@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.fields import parameter
-from dopt.systems.base import Array, Feature, System
+from dopt.systems.base import Array, Feature, System, identity, turn
 from dopt.systems.elementary import cos, magnitude, sin
 from dopt.types import Scalar
 
@@ -79,10 +79,7 @@ class Car(System):
     )
     input_labels: ClassVar[tuple[str, ...]] = ("u₁ [1]", "u₂ [1]")
     learned_rows: ClassVar[tuple[int, ...]] = (3, 4, 5)
-    features: ClassVar[tuple[Feature, ...]] = (
-        *(Feature("identity", 3), Feature("identity", 4), Feature("identity", 5)),
-        *(Feature("cos", 6), Feature("sin", 6)),
-    )
+    features: ClassVar[tuple[Feature, ...]] = (*identity(3, 4, 5), *turn(6))
     angle_indices: ClassVar[tuple[int, ...]] = (2, 6)
     phase_plane: ClassVar[tuple[int, int]] = (3, 4)
     grid_indices: ClassVar[tuple[int, ...]] = (3, 4, 5, 6)
@@ -188,7 +185,7 @@ class MovingStar(System):
     state_labels: ClassVar[tuple[str, ...]] = ("x [m]", "y [m]")
     input_labels: ClassVar[tuple[str, ...]] = ("uₓ [N]", "u_y [N]")
     learned_rows: ClassVar[tuple[int, ...]] = (0, 1)
-    features: ClassVar[tuple[Feature, ...]] = (Feature("identity", 0), Feature("identity", 1))
+    features: ClassVar[tuple[Feature, ...]] = identity(0, 1)
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
 

@@ -86,13 +86,6 @@ def eigenmode(system: System) -> Eigenmode | None:
     return Eigenmode(float(values[least].imag), float(-values[least].real), direction)
 
 
-def euler_spectral_radius(system: System) -> float:
-    """Return the spectral radius of x -> x + dt f(x, 0) at the stable equilibrium."""
-    state = system.equilibrium or system.initial_state
-    A, _ = jacobians(system, state, np.zeros(system.n_inputs))
-    return float(np.max(np.abs(1 + system.dt * np.linalg.eigvals(A))))
-
-
 TRIED = 64
 """States and inputs that are tried."""
 
@@ -137,8 +130,7 @@ def input_effect(system: System) -> InputEffect:
 def _known(system: System, states: Array, inputs: Array) -> Array:
     """Return the known part, (d, N), at states (d, N) and inputs (m, N)."""
     with np.errstate(all="ignore"):
-        flow = system.known(tuple(states), tuple(inputs), system.parameters)
-        values = np.stack(np.broadcast_arrays(*flow, states[0])[:-1])
+        values = system.known_flow(states.T, inputs.T).T
     return np.where(np.isfinite(values), values, 0.0)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dopt.fields import parameter
-from dopt.systems.base import Feature, System
+from dopt.systems.base import Feature, System, identity
 from dopt.systems.elementary import cos, magnitude, sin
 from dopt.types import Scalar
 
@@ -47,7 +47,7 @@ class Quadrotor(System):
     )
     input_labels: ClassVar[tuple[str, ...]] = ("u₁ [N]", "u₂ [N]")
     learned_rows: ClassVar[tuple[int, ...]] = (1, 3)
-    features: ClassVar[tuple[Feature, ...]] = (Feature("identity", 1), Feature("identity", 3))
+    features: ClassVar[tuple[Feature, ...]] = identity(1, 3)
     angle_indices: ClassVar[tuple[int, ...]] = (4,)
     phase_plane: ClassVar[tuple[int, int]] = (1, 3)
     grid_indices: ClassVar[tuple[int, ...]] = (1, 3)
@@ -145,9 +145,7 @@ class Drone(System):
     )
     input_labels: ClassVar[tuple[str, ...]] = ("u₁ [N]", "u₂ [N]", "u₃ [N]", "u₄ [N]")
     learned_rows: ClassVar[tuple[int, ...]] = (3, 4, 5, 10, 11, 12)
-    features: ClassVar[tuple[Feature, ...]] = tuple(
-        Feature("identity", index) for index in (3, 4, 5, 10, 11, 12)
-    )
+    features: ClassVar[tuple[Feature, ...]] = identity(3, 4, 5, 10, 11, 12)
     phase_plane: ClassVar[tuple[int, int]] = (3, 5)
     grid_indices: ClassVar[tuple[int, ...]] = (3, 4, 5, 10, 11, 12)
     low_discrepancy: ClassVar[bool] = True

@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks import processes
 from benchmarks.trials import CYCLE
 from dopt.kernel.from_spec import shared_points
-from dopt.kernel.loop import act_next
-from dopt.kernel.pointers import compiled_evaluation, compiled_step
+from dopt.kernel.loop import act_next, evaluate_next
+from dopt.kernel.pointers import compiled_step
 from dopt.kernel.run import KernelSteps
 from dopt.spec.trial import TrialSpec
 
@@ -64,7 +64,6 @@ class Steps(KernelSteps):
         policy, model = {"name": "d_optimal", "form": form}, {"name": "mlp", "width": width}
         parts = {"env": system, "policy": policy, "model": model, "learner": {"name": learner}}
         super().__init__(TrialSpec.from_mapping({**parts, "seed": 0}))
-        self._act, self.done = compiled_step(self.trial, act_next), 0
         self.about = f"{env}, width {width:,}", form, len(self.state.theta), steps
 
     def advance(self, last: int) -> float:
@@ -72,7 +71,7 @@ class Steps(KernelSteps):
         start, first, dt = time.thread_time(), self.done, self.spec.system.dt
         for t in range(first, last):
             self.plan_input(t)
-            if not (self._act(self._held, t) and self.take_in(t, dt)):
+            if not (self.call(act_next, t) and self.take_in(t, dt)):
                 raise RuntimeError(f"{self.about[0]} diverged at step {t}: choose weaker inputs.")
         self.done = last
         return 1e6 * (time.thread_time() - start) / (last - first)
@@ -123,12 +122,12 @@ def points(*blocks: int) -> Iterator[Row]:
     """Measure an evaluation by its number of points."""
     trial = Steps("cartpole", 64, 10, "sketch")
     whole = shared_points(trial.spec.config)
-    evaluate = compiled_evaluation(trial.trial, whole)
+    evaluate = compiled_step(trial.trial, evaluate_next, whole)
     for n in blocks:
         some, taken = whole._replace(bounds=np.array([0, n, n])), []
         for _ in range(SECTIONS):
             start = time.thread_time()
-            evaluate(trial._held, some, 0)
+            evaluate(trial.held, some, 0)
             taken.append(1e6 * (time.thread_time() - start))
         yield trial.row("N", int(whole.block_sizes[:n].sum()), min(taken))
 

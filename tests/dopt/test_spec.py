@@ -20,8 +20,8 @@ from dopt.policies import POLICIES, TITLES
 from dopt.run import run_trial
 from dopt.spec.config import completed, config_label, labels, value_label
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS, Pendulum
-from dopt.systems.properties import euler_spectral_radius, jacobians
+from dopt.systems import SYSTEMS, Pendulum, System
+from dopt.systems.properties import jacobians
 from tests.analysis.synthetic import make_spec
 from tests.dopt.trials import ALL_PAIRS, covering, trial
 from tests.paths import CONF
@@ -337,6 +337,13 @@ def reasons_of(name: str) -> str:
     path = CONF / f"env/{name}.yaml"
     text = path.read_text() if path.exists() else str(SYSTEMS[name].__doc__)
     return " ".join(line.lstrip("# ") for line in text.splitlines())
+
+
+def euler_spectral_radius(system: System) -> float:
+    """Return the spectral radius of x -> x + dt f(x, 0) at the stable equilibrium."""
+    state = system.equilibrium or system.initial_state
+    A, _ = jacobians(system, state, np.zeros(system.n_inputs))
+    return float(np.max(np.abs(1 + system.dt * np.linalg.eigvals(A))))
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

@@ -20,7 +20,7 @@ from dopt.kernel import cache, run, warming
 from dopt.kernel.compiler import compiled
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.held import HeldTrial, pointer_to, trial_in
-from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
+from dopt.kernel.pointers import compiled_for, held_kind, kind_of
 from dopt.kernel.run import KernelTrial, run_trial_in_kernel
 from dopt.kernel.warming import leave_callees_out
 from dopt.policies import Episodic
@@ -144,7 +144,7 @@ def test_a_pointer_reads_and_writes_what_the_structures_hold() -> None:
     waves = waves._replace(frequencies=np.arange(6.0).reshape(2, 3), scale=0.25)
     network = fast.trial.network._replace(waves=waves)
     fast.trial = fast.trial._replace(network=network)
-    function = compiled_for(path_of(numbers), numbers, (held_kind(fast.trial), kind_of(out)))
+    function = compiled_for(numbers, (held_kind(fast.trial), kind_of(out)))
     function(fast.held, out)
     assert out.tolist() == [plant.dt, plant.n_inputs, 0.25, 2.0, 1.0, 0.0, theta[1:3].sum()]
     assert fast.state.covariance.n_pending[0] == 7

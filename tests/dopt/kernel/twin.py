@@ -12,7 +12,7 @@ from numba.core.dispatcher import Dispatcher
 from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.linear_algebra import dense
 from dopt.kernel.loop import advance
-from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
+from dopt.kernel.pointers import compiled_for, held_kind, kind_of
 from dopt.kernel.run import KernelSteps, KernelTrial, NumpyParts
 from dopt.kernel.structs import Evaluation
 from dopt.spec.trial import TrialSpec
@@ -39,7 +39,7 @@ def call(function: CompiledFunction, *arguments: Any) -> Any:
     Behind pointers one compilation serves all systems, and the cache of the kernel keeps it.
     """
     kinds = tuple(map(kind_of, arguments))
-    return compiled_for(path_of(function), function, kinds)(*arguments)
+    return compiled_for(function, kinds)(*arguments)
 
 
 def interpreted(function: CompiledFunction) -> Any:
@@ -64,7 +64,7 @@ def model_of_kernel(spec: TrialSpec, parameters: Array | None = None) -> TrialVi
     steps = KernelSteps(spec)
     if parameters is not None:
         steps.trial.state.theta[:] = parameters
-    return NumpyParts(spec, steps.trial, steps._held)._view(0)
+    return NumpyParts(steps)._view(0)
 
 
 @kept
@@ -85,8 +85,6 @@ def run(fast: KernelTrial, steps: int) -> np.ndarray:
     parameters = np.empty((steps, len(fast.state.theta)))
     kinds = (held_kind(fast.trial), kind_of(fast.points), int64, float64[:, ::1])
     last = fast.done + steps
-    fast.done = compiled_for(path_of(record), record, kinds)(
-        fast.held, fast.points, fast.done, parameters
-    )
+    fast.done = compiled_for(record, kinds)(fast.held, fast.points, fast.done, parameters)
     assert fast.done == last, "the trial has diverged"
     return parameters

@@ -33,7 +33,6 @@ from dopt.systems import (
     VanDerPol,
 )
 from dopt.systems.elementary import cos, magnitude, sign, sin, tanh, where
-from dopt.systems.pendulum import LARGEST_ROW
 from dopt.systems.properties import jacobians
 from tests.dopt.systems.mechanics import MECHANICS
 from tests.dopt.test_checks import broken_system
@@ -125,7 +124,7 @@ def test_a_row_swings_in_the_modes_of_a_lattice_with_free_ends(n: int) -> None:
 
 
 def test_the_longest_row_loses_energy_in_every_mode_under_the_euler_map() -> None:
-    row = CoupledPendulums(n_pendulums=LARGEST_ROW)
+    row = CoupledPendulums(n_pendulums=CoupledPendulums.most)
     A, _ = jacobians(row, (0.0,) * row.n_states, np.zeros(1))
     assert np.abs(np.linalg.eigvals(np.eye(row.n_states) + row.dt * A)).max() < 1.0
 
