@@ -22,6 +22,9 @@ from dopt.types import Array
 SLOW = 0.01
 """Windows in which a joint is slower than this part of its limit teach nothing of its friction."""
 
+STUCK = 0.005
+"""Rate, as a part of its limit, below which a joint sticks though its reference moves."""
+
 SPEEDS = np.geomspace(0.02, 0.95, 12)
 """Parts of the velocity limit at which the friction curve is judged."""
 
@@ -248,7 +251,8 @@ class FrictionLearner:
         times, limit = self.window.times[1:-1], self.limits.velocity
         within = (v + times[:, None] * a) / limit
         x = within if rates is None else rates[1:] / limit
-        moving = (np.abs(x).min(axis=0) > SLOW) & (np.abs(np.sign(x).sum(axis=0)) == len(x))
+        way = np.sign(x.sum(axis=0))
+        moving = ((x * way).min(axis=0) > SLOW) & ((within * way).min(axis=0) > STUCK)
         within = within.T
         weights = self.window.weights[1:-1]
         parameters = self.mean[:, : self.p]
