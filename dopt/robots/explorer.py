@@ -39,6 +39,16 @@ EDGE = 0.02
 GUARDED = 0.9
 """Part of the velocity limit from which torques brake."""
 
+SURGE, AHEAD, FADED = 0.04, 2.0, 2.0
+"""Room for rates that run ahead of references.
+
+First by a period of this part of the torque limit, then by what was seen, which fades in so many
+seconds; it counts so many times.
+"""
+
+CREEP = 0.1
+"""Part of the velocity limit that references may always take."""
+
 FALSE_ALARM = 1e-8
 """Probability that an unchanged robot looks changed in a window."""
 
@@ -154,6 +164,7 @@ class RobotExplorer:
         self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
         n = self.body.n
         self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
+        self._ahead, self._fastest = np.zeros(n), limits.velocity
         self._wary, self._away = np.zeros(n, dtype=bool), 0.0  # since a contact was near
         self.counts = {"bad": 0, "late": 0, "near": 0, "plans": 0, "windows": 0, "changed": 0}
         self.warnings: list[str] = []
@@ -240,6 +251,9 @@ class RobotExplorer:
             )
         self._tracker.place(measured)
         self._q = measured.copy()
+        self.known.inverse(measured, self._v, self._v)
+        surge = SURGE * self.dt * self.limits.torque / self.known.apparent_inertia()
+        self._ahead = surge / self.limits.velocity
 
     def _check_time(self, time: float | None) -> None:
         """End the window of samples where the time is not the one that is expected."""
@@ -274,6 +288,7 @@ class RobotExplorer:
 
     def _advance(self, trusted: bool, until: float) -> None:
         """Move the references by a period, with new segments where one has ended."""
+        self._pace()
         if trusted and not self._done:
             for j in np.flatnonzero(self._hold <= 0.0):
                 if clock.perf_counter() > until:
@@ -284,8 +299,8 @@ class RobotExplorer:
                     self.counts["plans"] += 1
         else:
             self._target[:], self._hold[:] = 0.0, 0.0
-        most = self.acceleration
-        a = np.clip((self._target - self._v) / self.dt, -most, most)
+        most, target = self.acceleration, np.clip(self._target, -self._fastest, self._fastest)
+        a = np.clip((target - self._v) / self.dt, -most, most)
         v = self._v + a * self.dt
         rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
         blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
@@ -296,9 +311,15 @@ class RobotExplorer:
             a, v = brake, self._v + brake * self.dt
             self._rest()
         self._a, self._v, self._q = a, v, self._q + self.dt * v
-        reached = np.abs(self._v - self._target) < 1e-9
+        reached = np.abs(self._v - target) < 1e-9
         ended = blocked & ~self._wary
         self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
+
+    def _pace(self) -> None:
+        """Leave room between references and limits of velocity for rates that run ahead."""
+        ahead = (np.abs(self._tracker.v) - np.abs(self._v)) / self.limits.velocity
+        self._ahead = np.maximum(ahead, self._ahead * math.exp(-self.dt / FADED))
+        self._fastest = self.limits.velocity * np.maximum(1.0 - AHEAD * self._ahead, CREEP)
 
     def _rest(self) -> None:
         """Let all joints brake, and plan one after another when the last one is at rest."""
@@ -313,7 +334,8 @@ class RobotExplorer:
         A segment is one equation: the mean of its features, with the noise of its windows.
         """
         learner, most, p = self.learner, self.acceleration[j], self.learner.p
-        speeds = np.repeat(np.concatenate([LEVELS, -LEVELS]), len(HOLDS))
+        levels = np.minimum(LEVELS, self._fastest[j] / self.limits.velocity[j])
+        speeds = np.repeat(np.concatenate([levels, -levels]), len(HOLDS))
         u = speeds * self.limits.velocity[j]
         hold = np.tile(HOLDS * learner.window.seconds, 2 * len(LEVELS))
         least = hold[0]

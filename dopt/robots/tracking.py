@@ -84,7 +84,7 @@ class Tracker:
         Errors push their own joint alone: one that sticks would else push the others ahead.
         """
         rigid = self.known.inverse(self.q, self.v, a)
-        inertia = 1.0 / np.diag(np.linalg.inv(self.known.mass_matrix()))
+        inertia = self.known.apparent_inertia()
         jitter = 2.0 * FOLLOWED * ENCODER / self.dt**2 * inertia
         self._fast = np.clip(np.cbrt(JITTER * self.limits.torque / jitter), *FAST)
         bandwidth = np.minimum(FOLLOWED * self._fast / self.dt, BANDWIDTH)

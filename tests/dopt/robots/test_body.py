@@ -384,9 +384,28 @@ def test_home_is_within_the_ranges_and_what_touches_there_is_named() -> None:
     assert away.notes == ()
     assert [pair for _, *pair in away.collisions(np.zeros((1, 2)))] == [["world", "fore"]]
     assert within.notes == (
-        "left out: contacts of bodies that touch where the file puts them: world and fore",
+        "left out: contacts less than 5 mm deeper than where the file puts them: world and fore",
     )
     assert within.collisions(np.zeros((1, 2))) == []
+
+
+def test_bodies_that_touch_at_home_may_touch_as_deep_and_no_deeper() -> None:
+    """Once they were not looked at, and a panda drove its wrist 49 mm into its forearm."""
+    body = body_of(
+        """<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1"/>
+        <body name="axle"><joint axis="0 0 1" range="-170 170"/>
+        <geom pos="0 0 0.11" size="0.03"/>
+        <body name="push" pos="0.12 0 0"><joint type="slide" axis="1 0 0" range="-0.05 0.2"/>
+        <geom size="0.03"/></body></body></worldbody></mujoco>"""
+    )
+    assert body.notes == (
+        "left out: contacts of bodies that touch in all positions: world and axle",
+        "left out: contacts less than 5 mm deeper than where the file puts them: world and push",
+    )
+    places = np.array([[0.0, 0.0], [0.0, -0.004], [0.0, -0.006], [0.0, 0.1]])
+    assert body.collisions(places) == [(2, "world", "push")]
+    assert Contacts(body, 0.01, 0.03).room(places[0]) == pytest.approx(0.001, abs=1e-6)
+    assert Contacts(body, 0.01, 0.03).room(places[1]) < 0.0
 
 
 def test_room_is_the_distance_beyond_the_one_to_keep() -> None:
