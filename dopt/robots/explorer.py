@@ -39,7 +39,7 @@ EDGE = 0.02
 GUARDED = 0.9
 """Part of the velocity limit from which torques brake."""
 
-SURGE, AHEAD, FADED = 0.04, 2.0, 2.0
+SURGE, AHEAD, FADED = 0.04, 2.5, 4.0
 """Room for rates that run ahead of references.
 
 First by a period of this part of the torque limit, then by what was seen, which fades in so many

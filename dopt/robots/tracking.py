@@ -18,7 +18,7 @@ JITTER = 0.003
 FAST = 0.3, 0.65
 """Least and most of the observer's error that a period of control removes."""
 
-FOLLOWED = 0.23
+FOLLOWED = 0.27
 """Bandwidth of tracking by the observer's; errors are damped critically."""
 
 BANDWIDTH = 75.0
