@@ -84,21 +84,28 @@ class Tracker:
         Errors push their own joint alone: one that sticks would else push the others ahead.
         """
         rigid = self.known.inverse(self.q, self.v, a)
+        stiffness, damping = self._gains()
+        pushed = stiffness * (q - self.q) + damping * (v - self.v)
+        demand = rigid + self.friction(v) + pushed
+        return np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
+
+    def _gains(self) -> tuple[Array, Array]:
+        """Return stiffness and damping, (n,), where the known body is, and pace the observer.
+
+        The lighter a joint is for its torque, the less the steps of its encoder shake it.
+        """
         inertia = self.known.apparent_inertia()
         jitter = 2.0 * FOLLOWED * ENCODER / self.dt**2 * inertia
         self._fast = np.clip(np.cbrt(JITTER * self.limits.torque / jitter), *FAST)
         bandwidth = np.minimum(FOLLOWED * self._fast / self.dt, BANDWIDTH)
-        self._stiffness = inertia * bandwidth**2
-        pushed = self._stiffness * (q - self.q) + 2.0 * inertia * bandwidth * (v - self.v)
-        demand = rigid + self.friction(v) + pushed
-        return np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
+        return inertia * bandwidth**2, 2.0 * inertia * bandwidth
 
     def lag(self, torque: Array) -> Array:
         """Return the error of position, (n,), that feeds back a torque [N m], (n,).
 
         A reference that is moved back by what a better feedforward makes up for does not hurry.
         """
-        result: Array = torque / self._stiffness
+        result: Array = torque / self._gains()[0]
         return result
 
 
