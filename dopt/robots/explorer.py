@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
-from dopt.robots.body import Body, KnownBody, Motion
+from dopt.robots.body import Body, KnownBody, Motion, listed
 from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard, Tracker, possible_acceleration
@@ -39,7 +39,7 @@ EDGE = 0.02
 GUARDED = 0.9
 """Part of the velocity limit from which torques brake."""
 
-SURGE, AHEAD, FADED = 0.04, 2.5, 4.0
+SURGE, AHEAD, FADED = 0.04, 3.0, 4.0
 """Room for rates that run ahead of references.
 
 First by a period of this part of the torque limit, then by what was seen, which fades in so many
@@ -254,6 +254,11 @@ class RobotExplorer:
         self.known.inverse(measured, self._v, self._v)
         surge = SURGE * self.dt * self.limits.torque / self.known.apparent_inertia()
         self._ahead = surge / self.limits.velocity
+        if light := [self.body.joints[j] for j in np.flatnonzero(self._ahead > 1.0)]:
+            self._say(
+                f"within {1e3 * self.dt:g} ms, {100.0 * SURGE:g} % of the limit of torque turns "
+                f"{listed(light)} as fast as it may: give the armature in the robot's file"
+            )
 
     def _check_time(self, time: float | None) -> None:
         """End the window of samples where the time is not the one that is expected."""
