@@ -129,7 +129,7 @@ class Body:
             ) from error
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
-            urdf = "inertia" in text and b"<robot" in source.read_bytes()
+            urdf = ("balanceinertia" in text or "mjMINVAL" in text) and b"<robot" in source.read_bytes()
             remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "

@@ -13,7 +13,7 @@ import pytest
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, Motion
 from dopt.robots.limits import Limits, check_weight
-from dopt.robots.parameters import Identifiability, Unknowns, relative_errors
+from dopt.robots.parameters import Identifiability, Unknowns, count_null, relative_errors
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
 
@@ -341,9 +341,27 @@ def test_wrong_parameters_are_named(arm: Body, limits: Limits, wanted: str, said
         Unknowns(arm, limits, wanted)
 
 
+def test_all_null_directions_are_said_beside_one_of_a_tiny_moment(tmp_path: Path) -> None:
+    """Masses, moments, friction and gears scale together: once that one of ten was lost."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint axis="0 1 0" range="-2 2" damping="0.05"/>
+        <inertial mass="0.26" pos="0 2e-6 0.08" diaginertia="1.2e-3 1.2e-3 3e-6"/>
+        <body pos="0 0.04 0.135"><joint axis="0 1 0" range="-2 2" damping="0.05"/>
+        <inertial mass="0.33" pos="0 1e-8 0.1" diaginertia="2.5e-3 2.5e-3 2e-6"/>
+        </body></body></worldbody></mujoco>"""
+    )
+    given = "joints: {default: {velocity: 4, acceleration: 30, torque: 3}}"
+    unknowns = Unknowns(body, limits_of(body, tmp_path, given), "all")
+    motion = random_motion(2, 200)
+    null = Identifiability.of(unknowns, motion, 100.0).null
+    assert len(null) == count_null(unknowns, motion)
+    assert any("gear" in text for text in null)
+
+
 FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>
 <link name="b"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="3" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+NEGATIVE = FLAT.replace('izz="3"', 'izz="-1"')
 
 
 @pytest.mark.parametrize(
@@ -352,6 +370,7 @@ FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/><
         ("<mujoco><worldbody/></mujoco>", "no hinge or slide"),
         ("<mujoco><worldbody>", "cannot be read"),
         (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
+        (f'<robot name="r"><link name="a"/>{NEGATIVE}</robot>', "expected: correct it"),
         ("", "robot.xml"),
     ],
 )
