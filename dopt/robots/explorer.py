@@ -46,6 +46,12 @@ First by a period of this part of the torque limit, then by what was seen, which
 seconds; it counts so many times.
 """
 
+SLIP, EASED = 0.2, 0.15
+"""Part of the velocity limit by which a joint that breaks loose is ahead of its reference.
+
+Of the error that pushed it, a part is forgotten each period.
+"""
+
 CREEP = 0.1
 """Part of the velocity limit that references may always take."""
 
@@ -323,6 +329,7 @@ class RobotExplorer:
     def _pace(self) -> None:
         """Leave room between references and limits of velocity for rates that run ahead."""
         ahead = (np.abs(self._tracker.v) - np.abs(self._v)) / self.limits.velocity
+        self._q = np.where(ahead > SLIP, self._q + EASED * (self._tracker.q - self._q), self._q)
         self._ahead = np.maximum(ahead, self._ahead * math.exp(-self.dt / FADED))
         self._fastest = self.limits.velocity * np.maximum(1.0 - AHEAD * self._ahead, CREEP)
 
