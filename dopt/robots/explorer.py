@@ -70,6 +70,9 @@ LOST = 50
 AWAY = 1.0
 """Seconds for which references lead away from a contact that torques came near."""
 
+STEP = 1e-6
+"""Step of rates, as parts of the velocity limit, for the derivative of J."""
+
 INPUTS = ("references", "torques")
 
 _log = logging.getLogger("dopt.robots")
@@ -396,8 +399,9 @@ class RobotExplorer:
         idle = inverse @ (-bias - friction)
         x = ((tracker.v + self.dt * idle) / limits.velocity)[:, None]
         parameters = learner.mean[:, :p]
-        J = learner.model.jacobian(parameters, x)[:, 0]
-        bent = learner.model.slopes(parameters, x)[1][:, 0] / limits.velocity[:, None]
+        near = x + STEP * np.array([-1.0, 0.0, 1.0])
+        before, J, behind = np.moveaxis(learner.model.jacobian(parameters, near), 1, 0)
+        bent = (behind - before) / (2.0 * STEP * limits.velocity[:, None])
         weighed = (learner.covariance[:, :p, :p] @ bent[..., None])[..., 0]
         D = self.dt * inverse * limits.torque
         Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)

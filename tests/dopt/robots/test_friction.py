@@ -21,16 +21,11 @@ def test_derivatives_are_limits_of_differences(model: CoulombViscous | Network) 
     x = random.uniform(-1.0, 1.0, (3, 5))
     x[:, 0] = 0.002
     J = model.jacobian(parameters, x)
-    slopes, of_rows = model.slopes(parameters, x)
     for k in range(model.start.shape[1]):
         moved = np.zeros_like(parameters)
         moved[:, k] = step
         difference = model.torques(parameters + moved, x) - model.torques(parameters - moved, x)
         np.testing.assert_allclose(J[..., k], difference / (2 * step), atol=1e-6)
-    difference = model.torques(parameters, x + step) - model.torques(parameters, x - step)
-    np.testing.assert_allclose(slopes, difference / (2 * step), rtol=1e-4, atol=1e-6)
-    difference = model.jacobian(parameters, x + step) - model.jacobian(parameters, x - step)
-    np.testing.assert_allclose(of_rows, difference / (2 * step), rtol=1e-4, atol=2e-5)
 
 
 def test_a_window_is_exact_where_torque_accelerates_a_mass() -> None:
