@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from dopt.errors import SpecificationError, given_path, install_command
 from dopt.systems.mujoco import log_warnings
@@ -129,7 +130,8 @@ class Body:
             ) from error
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
-            urdf = ("balanceinertia" in text or "mjMINVAL" in text) and b"<robot" in source.read_bytes()
+            bounded = "inertia" in text and "eigenvalues" not in text
+            urdf = bounded and b"<robot" in source.read_bytes()
             remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
@@ -174,7 +176,7 @@ class Body:
 
     @property
     def ranges(self) -> Array:
-        """Ranges of the driven joints in the file, (n, 2); a turn, or a metre, where it has none."""
+        """Ranges of the driven joints in the file, (n, 2); without any, a turn or a metre."""
         limited = self.model.jnt_limited[self._ids].astype(bool)
         free = np.where(self.model.jnt_type[self._ids] == HINGE, np.pi, 0.5)
         around = self.home[:, None] + free[:, None] * [-1.0, 1.0]
@@ -239,7 +241,8 @@ class Body:
                 moved = motion.positions[:, k] - model.qpos0[self.addresses[k]]
                 if model.jnt_type[j] == HINGE:
                     column = np.concatenate([axis, _cross(anchor, axis)], axis=1)
-                    turn = turn @ _turns(model.jnt_axis[j], moved)
+                    turns = Rotation.from_rotvec(np.outer(moved, model.jnt_axis[j]))
+                    turn = turn @ turns.as_matrix()
                     origin = anchor - turn @ model.jnt_pos[j]
                 else:
                     column = np.concatenate([np.zeros_like(axis), axis], axis=1)
@@ -276,7 +279,7 @@ class Body:
         return block
 
     def collisions(self, positions: Array) -> list[tuple[int, str, str]]:
-        """Return where bodies touch that do not touch at home, or deeper: row, and the two bodies' names.
+        """Return where bodies touch that do not at home, or deeper: row, and the two bodies' names.
 
         Parameters
         ----------
@@ -511,19 +514,9 @@ def _crossed(velocity: Array, column: Array) -> Array:
     return np.concatenate([_cross(spin, column[:, :3]), linear], axis=1)
 
 
-def _turns(axis: Array, angles: Array) -> Array:
-    """Return rotations about an axis, (T, 3, 3), by the formula of Rodrigues."""
-    k = _skew(axis[None])[0]
-    s, c = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    result: Array = np.eye(3) + s * k + (1.0 - c) * (k @ k)
-    return result
-
-
 def rotation(quaternion: Array) -> Array:
     """Return the rotation of a unit quaternion (w, x, y, z), (3, 3)."""
-    w, v = quaternion[0], quaternion[1:]
-    k = _skew(v[None])[0]
-    result: Array = np.eye(3) + 2.0 * (w * k + k @ k)
+    result: Array = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     return result
 
 

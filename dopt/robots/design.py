@@ -393,15 +393,12 @@ def attainable(problem: Problem, rng: np.random.Generator) -> tuple[float, float
     p, s = len(problem.unknowns), problem.count
     weights = np.full(len(rows), 1.0 / len(rows))
     flat = rows.reshape(-1, p)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS + 1):
         information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
         slopes = _slopes(information + np.eye(p), rows, s)
-        mean = float(weights @ slopes)
+        mean, gap = float(weights @ slopes), float(slopes.max() - weights @ slopes)
         weights = weights * np.sqrt(np.maximum(slopes, 0.0) / mean)
         weights /= weights.sum()
-    information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
-    slopes = _slopes(information + np.eye(p), rows, s)
-    gap = float(slopes.max() - weights @ slopes)
     return problem.determinant(information) + gap, gap
 
 

@@ -108,3 +108,12 @@ def test_slow_windows_teach_nothing() -> None:
     assert np.isfinite(slow[1])
     np.testing.assert_array_equal(learner.covariance[0], before[0])
     assert (learner.covariance[1] != before[1]).any()
+
+
+def test_a_joint_that_sticks_while_its_reference_moves_teaches_nothing() -> None:
+    """Once its torque counted as friction, which was learned too large and drove light joints."""
+    learner = FrictionLearner(limits(3), nothing)
+    rates = np.tile([0.2, 0.2, 0.2], (learner.window.size, 1))
+    means = np.zeros(3), np.array([0.004, 0.2, -0.2]), np.zeros(3), np.full(3, 5.0)
+    found = learner.learn(means, rates)
+    np.testing.assert_array_equal(np.isnan(found), [True, False, True])
