@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from dopt.errors import SpecificationError, given_path, install_command
 from dopt.systems.mujoco import log_warnings
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia="1e-6"/></mujoco>'
 """Settings with which an URDF is read whose inertias no rigid body can have."""
+
+DEEPER, ANYWHERE = 0.005, 200
+"""Metres by which bodies that touch at home may come deeper, and random positions looked at."""
 
 INERTIAL = 10
 """Inertial parameters of a body: m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about its origin."""
@@ -126,7 +130,8 @@ class Body:
             ) from error
         except (ValueError, OSError) as error:
             text = " ".join(str(error).split())
-            urdf = "inertia" in text and b"<robot" in source.read_bytes()
+            bounded = "inertia" in text and "eigenvalues" not in text
+            urdf = bounded and b"<robot" in source.read_bytes()
             remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
@@ -167,6 +172,15 @@ class Body:
         low, high = model.jnt_range[self._ids].T
         outside = model.jnt_limited[self._ids] & ((positions < low) | (positions > high))
         result: Array = np.where(outside, (low + high) / 2.0, positions)
+        return result
+
+    @property
+    def ranges(self) -> Array:
+        """Ranges of the driven joints in the file, (n, 2); without any, a turn or a metre."""
+        limited = self.model.jnt_limited[self._ids].astype(bool)
+        free = np.where(self.model.jnt_type[self._ids] == HINGE, np.pi, 0.5)
+        around = self.home[:, None] + free[:, None] * [-1.0, 1.0]
+        result: Array = np.where(limited[:, None], self.model.jnt_range[self._ids], around)
         return result
 
     def _inertial_of(self, b: int) -> Array:
@@ -227,7 +241,8 @@ class Body:
                 moved = motion.positions[:, k] - model.qpos0[self.addresses[k]]
                 if model.jnt_type[j] == HINGE:
                     column = np.concatenate([axis, _cross(anchor, axis)], axis=1)
-                    turn = turn @ _turns(model.jnt_axis[j], moved)
+                    turns = Rotation.from_rotvec(np.outer(moved, model.jnt_axis[j]))
+                    turn = turn @ turns.as_matrix()
                     origin = anchor - turn @ model.jnt_pos[j]
                 else:
                     column = np.concatenate([np.zeros_like(axis), axis], axis=1)
@@ -264,7 +279,7 @@ class Body:
         return block
 
     def collisions(self, positions: Array) -> list[tuple[int, str, str]]:
-        """Return where bodies touch that do not touch at home: row, and the two bodies' names.
+        """Return where bodies touch that do not at home, or deeper: row, and the two bodies' names.
 
         Parameters
         ----------
@@ -323,6 +338,11 @@ class KnownBody:
             M[k] = self._column[dofs]
         return M
 
+    def apparent_inertia(self) -> Array:
+        """Return the inertia of each joint while the others are free, (n,), where M is."""
+        result: Array = 1.0 / np.diag(np.linalg.inv(self.mass_matrix()))
+        return result
+
     def hang(self, mass: float, moment: Array) -> None:
         """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
         model, last = self.model, self.body.moved[-1]
@@ -337,7 +357,9 @@ class KnownBody:
 
 
 class Contacts:
-    """Pairs of bodies that come near each other, and do not touch at home.
+    """Pairs of bodies that come near each other.
+
+    Those that touch at home may touch as deep; those that touch everywhere are left out.
 
     Parameters
     ----------
@@ -361,9 +383,17 @@ class Contacts:
         self._kept = np.full((model.nbody, model.nbody), -np.inf)
         self._kept[moved] = self._kept[:, moved] = apart
         pairs, distances = self._pass(body.home)
-        at_home = np.where((distances > 0.0) & (seen > 0.0), 0.5 * distances, -np.inf)
+        deeper = np.minimum(distances, 0.0) - (0.2 * DEEPER if seen else DEEPER)
+        at_home = np.where((distances > 0.0) & (seen > 0.0), 0.5 * distances, deeper)
         for a, b in (pairs.T, pairs.T[::-1]):
             np.minimum.at(self._kept, (a, b), at_home)
+        self.touching = self._touching(body.home)
+        self.always, random = set(self.touching), np.random.default_rng(0)
+        low, high = body.ranges.T
+        for q in low + (high - low) * random.random((ANYWHERE * bool(self.always), body.n)):
+            self.always &= self._touching(q)
+        for a, b in self.always:
+            self._kept[a, b] = self._kept[b, a] = -np.inf
 
     def _pass(self, positions: Array) -> tuple[npt.NDArray[np.int32], Array]:
         """Return the bodies of each contact, (k, 2), and their distances, (k,) [m]."""
@@ -375,21 +405,30 @@ class Contacts:
         contact = data.contact
         return self._model.geom_bodyid[contact.geom], np.array(contact.dist)
 
+    def _touching(self, positions: Array) -> set[tuple[int, int]]:
+        """Return the pairs with a moved body that touch at positions, (n,)."""
+        pairs, distances = self._pass(positions)
+        touching = {(min(pair), max(pair)) for pair in pairs[distances <= 0.0].tolist()}
+        return {pair for pair in touching if {*pair} & {*self._body.moved}}
+
     def left_out(self) -> list[str]:
-        """Name the bodies that touch at home, of which contacts are not counted."""
-        pairs = {tuple(sorted(pair)) for pair in self._pass(self._body.home)[0].tolist()}
-        touching = [
-            " and ".join(_name(self._model, self._engine.mjtObj.mjOBJ_BODY, b) for b in pair)
-            for pair in sorted(pairs)
-            if set(pair) & set(self._body.moved)
+        """Name the bodies that touch at home, of which contacts are not counted, or deeper ones."""
+        deeper = f"contacts less than {1e3 * DEEPER:g} mm deeper than where the file puts them"
+        said = (("contacts of bodies that touch in all positions", self.always),)
+        said += ((deeper, self.touching - self.always),)
+        kind = self._engine.mjtObj.mjOBJ_BODY
+        return [
+            f"left out: {what}: "
+            + listed([" and ".join(_name(self._model, kind, b) for b in p) for p in sorted(pairs)])
+            for what, pairs in said
+            if pairs
         ]
-        what = "left out: contacts of bodies that touch where the file puts them"
-        return [f"{what}: {listed(touching)}"] if touching else []
 
     def near(self, positions: Array) -> set[tuple[int, int]]:
         """Return the pairs that the engine finds in contact at positions, (n,)."""
-        pairs, _ = self._pass(positions)
-        counted = np.isfinite(self._kept[pairs[:, 0], pairs[:, 1]])
+        pairs, distances = self._pass(positions)
+        kept = self._kept[pairs[:, 0], pairs[:, 1]]
+        counted = (kept >= 0.0) | (distances < kept)
         return {(min(pair), max(pair)) for pair in pairs[counted].tolist()}
 
     def room(self, positions: Array) -> float:
@@ -475,19 +514,9 @@ def _crossed(velocity: Array, column: Array) -> Array:
     return np.concatenate([_cross(spin, column[:, :3]), linear], axis=1)
 
 
-def _turns(axis: Array, angles: Array) -> Array:
-    """Return rotations about an axis, (T, 3, 3), by the formula of Rodrigues."""
-    k = _skew(axis[None])[0]
-    s, c = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    result: Array = np.eye(3) + s * k + (1.0 - c) * (k @ k)
-    return result
-
-
 def rotation(quaternion: Array) -> Array:
     """Return the rotation of a unit quaternion (w, x, y, z), (3, 3)."""
-    w, v = quaternion[0], quaternion[1:]
-    k = _skew(v[None])[0]
-    result: Array = np.eye(3) + 2.0 * (w * k + k @ k)
+    result: Array = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     return result
 
 

@@ -169,7 +169,8 @@ class Problem:
 
     def _strains(self, motion: Motion, rigid: Array | None = None) -> Array:
         """Return torques as shares of their limits, friction included, (T, n)."""
-        friction = self._friction * np.tanh(motion.velocities / (0.01 * self.limits.velocity))
+        rates, (dry, viscous) = motion.velocities, self._friction
+        friction = dry * np.tanh(rates / (0.01 * self.limits.velocity)) + viscous * rates
         result: Array = (self.body.torques(motion, rigid) + friction) / self.limits.torque
         return np.abs(result)
 
@@ -214,11 +215,10 @@ class Problem:
         return dataclasses.replace(one, broken=1.0) if self.obstacle(one) else one
 
 
-def _friction(body: Body, limits: Limits) -> Array:
-    """Return the friction of each joint at its limit of velocity, or a typical one, (n,)."""
-    model = body.model
-    own = model.dof_frictionloss[body.dofs] + model.dof_damping[body.dofs] * limits.velocity
-    return np.where(own > 0.0, own, 0.1 * limits.torque)
+def _friction(body: Body, limits: Limits) -> tuple[Array, Array]:
+    """Return dry and viscous friction of each joint, (n,); where it has none, typical dry one."""
+    dry, viscous = body.model.dof_frictionloss[body.dofs], body.model.dof_damping[body.dofs]
+    return np.where(dry + viscous > 0.0, dry, 0.1 * limits.torque), viscous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -393,15 +393,12 @@ def attainable(problem: Problem, rng: np.random.Generator) -> tuple[float, float
     p, s = len(problem.unknowns), problem.count
     weights = np.full(len(rows), 1.0 / len(rows))
     flat = rows.reshape(-1, p)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS + 1):
         information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
         slopes = _slopes(information + np.eye(p), rows, s)
-        mean = float(weights @ slopes)
+        mean, gap = float(weights @ slopes), float(slopes.max() - weights @ slopes)
         weights = weights * np.sqrt(np.maximum(slopes, 0.0) / mean)
         weights /= weights.sum()
-    information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
-    slopes = _slopes(information + np.eye(p), rows, s)
-    gap = float(slopes.max() - weights @ slopes)
     return problem.determinant(information) + gap, gap
 
 

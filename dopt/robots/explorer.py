@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
-from dopt.robots.body import Body, KnownBody, Motion
+from dopt.robots.body import Body, KnownBody, Motion, listed
 from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard, Tracker, possible_acceleration
@@ -39,6 +39,22 @@ EDGE = 0.02
 GUARDED = 0.9
 """Part of the velocity limit from which torques brake."""
 
+SURGE, AHEAD, FADED = 0.04, 3.0, 4.0
+"""Room for rates that run ahead of references.
+
+First by a period of this part of the torque limit, then by what was seen, which fades in so many
+seconds; it counts so many times.
+"""
+
+SLIP, EASED = 0.2, 0.15
+"""Part of the velocity limit by which a joint that breaks loose is ahead of its reference.
+
+Of the error that pushed it, a part is forgotten each period.
+"""
+
+CREEP = 0.1
+"""Part of the velocity limit that references may always take."""
+
 FALSE_ALARM = 1e-8
 """Probability that an unchanged robot looks changed in a window."""
 
@@ -53,6 +69,9 @@ LOST = 50
 
 AWAY = 1.0
 """Seconds for which references lead away from a contact that torques came near."""
+
+STEP = 1e-6
+"""Step of rates, as parts of the velocity limit, for the derivative of J."""
 
 INPUTS = ("references", "torques")
 
@@ -154,6 +173,7 @@ class RobotExplorer:
         self._low, self._high = limits.position[:, 0] + edge, limits.position[:, 1] - edge
         n = self.body.n
         self._q, self._v, self._a, self._target, self._hold, self._measured = np.zeros((6, n))
+        self._ahead, self._fastest = np.zeros(n), limits.velocity
         self._wary, self._away = np.zeros(n, dtype=bool), 0.0  # since a contact was near
         self.counts = {"bad": 0, "late": 0, "near": 0, "plans": 0, "windows": 0, "changed": 0}
         self.warnings: list[str] = []
@@ -240,6 +260,14 @@ class RobotExplorer:
             )
         self._tracker.place(measured)
         self._q = measured.copy()
+        self.known.inverse(measured, self._v, self._v)
+        surge = SURGE * self.dt * self.limits.torque / self.known.apparent_inertia()
+        self._ahead = surge / self.limits.velocity
+        if light := [self.body.joints[j] for j in np.flatnonzero(self._ahead > 1.0)]:
+            self._say(
+                f"within {1e3 * self.dt:g} ms, {100.0 * SURGE:g} % of the limit of torque turns "
+                f"{listed(light)} as fast as it may: give the armature in the robot's file"
+            )
 
     def _check_time(self, time: float | None) -> None:
         """End the window of samples where the time is not the one that is expected."""
@@ -274,6 +302,7 @@ class RobotExplorer:
 
     def _advance(self, trusted: bool, until: float) -> None:
         """Move the references by a period, with new segments where one has ended."""
+        self._pace()
         if trusted and not self._done:
             for j in np.flatnonzero(self._hold <= 0.0):
                 if clock.perf_counter() > until:
@@ -284,8 +313,8 @@ class RobotExplorer:
                     self.counts["plans"] += 1
         else:
             self._target[:], self._hold[:] = 0.0, 0.0
-        most = self.acceleration
-        a = np.clip((self._target - self._v) / self.dt, -most, most)
+        most, target = self.acceleration, np.clip(self._target, -self._fastest, self._fastest)
+        a = np.clip((target - self._v) / self.dt, -most, most)
         v = self._v + a * self.dt
         rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
         blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
@@ -296,9 +325,16 @@ class RobotExplorer:
             a, v = brake, self._v + brake * self.dt
             self._rest()
         self._a, self._v, self._q = a, v, self._q + self.dt * v
-        reached = np.abs(self._v - self._target) < 1e-9
+        reached = np.abs(self._v - target) < 1e-9
         ended = blocked & ~self._wary
         self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
+
+    def _pace(self) -> None:
+        """Leave room between references and limits of velocity for rates that run ahead."""
+        ahead = (np.abs(self._tracker.v) - np.abs(self._v)) / self.limits.velocity
+        self._q = np.where(ahead > SLIP, self._q + EASED * (self._tracker.q - self._q), self._q)
+        self._ahead = np.maximum(ahead, self._ahead * math.exp(-self.dt / FADED))
+        self._fastest = self.limits.velocity * np.maximum(1.0 - AHEAD * self._ahead, CREEP)
 
     def _rest(self) -> None:
         """Let all joints brake, and plan one after another when the last one is at rest."""
@@ -313,7 +349,8 @@ class RobotExplorer:
         A segment is one equation: the mean of its features, with the noise of its windows.
         """
         learner, most, p = self.learner, self.acceleration[j], self.learner.p
-        speeds = np.repeat(np.concatenate([LEVELS, -LEVELS]), len(HOLDS))
+        levels = np.minimum(LEVELS, self._fastest[j] / self.limits.velocity[j])
+        speeds = np.repeat(np.concatenate([levels, -levels]), len(HOLDS))
         u = speeds * self.limits.velocity[j]
         hold = np.tile(HOLDS * learner.window.seconds, 2 * len(LEVELS))
         least = hold[0]
@@ -362,8 +399,9 @@ class RobotExplorer:
         idle = inverse @ (-bias - friction)
         x = ((tracker.v + self.dt * idle) / limits.velocity)[:, None]
         parameters = learner.mean[:, :p]
-        J = learner.model.jacobian(parameters, x)[:, 0]
-        bent = learner.model.slopes(parameters, x)[1][:, 0] / limits.velocity[:, None]
+        near = x + STEP * np.array([-1.0, 0.0, 1.0])
+        before, J, behind = np.moveaxis(learner.model.jacobian(parameters, near), 1, 0)
+        bent = (behind - before) / (2.0 * STEP * limits.velocity[:, None])
         weighed = (learner.covariance[:, :p, :p] @ bent[..., None])[..., 0]
         D = self.dt * inverse * limits.torque
         Q = D.T @ ((bent * weighed).sum(axis=1)[:, None] * D)

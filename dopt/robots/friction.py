@@ -22,6 +22,9 @@ from dopt.types import Array
 SLOW = 0.01
 """Windows in which a joint is slower than this part of its limit teach nothing of its friction."""
 
+STUCK = 0.005
+"""Rate, as a part of its limit, below which a joint sticks though its reference moves."""
+
 SPEEDS = np.geomspace(0.02, 0.95, 12)
 """Parts of the velocity limit at which the friction curve is judged."""
 
@@ -58,9 +61,6 @@ class FrictionModel(Protocol):
     def jacobian(self, parameters: Array, x: Array) -> Array:
         """Return J = ∂f/∂θ, (n, k, p)."""
 
-    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
-        """Return ∂f/∂x, (n, k), and ∂J/∂x, (n, k, p)."""
-
 
 class CoulombViscous:
     """Coulomb and viscous friction, and Stribeck terms of fixed widths: linear in its parameters.
@@ -83,15 +83,6 @@ class CoulombViscous:
         heights = sign[..., None] * np.exp(-((x[..., None] / self.widths) ** 2))
         return np.concatenate([sign[..., None], x[..., None], heights], axis=2)
 
-    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
-        sign = np.tanh(x / SIGN)
-        turned = (1.0 - sign**2) / SIGN
-        bells = np.exp(-((x[..., None] / self.widths) ** 2))
-        falling = bells * -2.0 * x[..., None] / self.widths**2
-        heights = turned[..., None] * bells + sign[..., None] * falling
-        rows = np.concatenate([turned[..., None], np.ones_like(x)[..., None], heights], axis=2)
-        return np.einsum("nkp,np->nk", rows, parameters), rows
-
 
 class Network:
     """Network of 7 tanh units of the rate: f(x) = d + Σ_k c_k tanh(s_k x + b_k), 22 parameters.
@@ -109,28 +100,16 @@ class Network:
         self.start[:, :7] = random.uniform(0.0005, 0.001, (n, 7))
         self.start[:, 7:14] = np.log(self.scales)
 
-    def _units(self, parameters: Array, x: Array) -> tuple[Array, Array, Array, Array]:
-        c, s = parameters[:, None, :7], np.exp(parameters[:, None, 7:14])
-        t = np.tanh(s * x[..., None] + parameters[:, None, 14:21])
-        return c, s, t, 1.0 - t**2
-
     def torques(self, parameters: Array, x: Array) -> Array:
-        c, _, t, _ = self._units(parameters, x)
-        result: Array = (c * t).sum(axis=2) + parameters[:, 21:]
+        t = self.jacobian(parameters, x)[..., :7]
+        result: Array = (parameters[:, None, :7] * t).sum(axis=2) + parameters[:, 21:]
         return result
 
     def jacobian(self, parameters: Array, x: Array) -> Array:
-        c, s, t, bent = self._units(parameters, x)
-        one = np.ones((*x.shape, 1))
-        return np.concatenate([t, c * bent * s * x[..., None], c * bent, one], axis=2)
-
-    def slopes(self, parameters: Array, x: Array) -> tuple[Array, Array]:
-        c, s, t, bent = self._units(parameters, x)
-        falling = -2.0 * t * bent * s
-        of_scales = c * s * (bent + falling * x[..., None])
-        none = np.zeros((*x.shape, 1))
-        rows = np.concatenate([bent * s, of_scales, c * falling, none], axis=2)
-        return (c * bent * s).sum(axis=2), rows
+        c, s = parameters[:, None, :7], np.exp(parameters[:, None, 7:14])
+        t = np.tanh(s * x[..., None] + parameters[:, None, 14:21])
+        bent = c * (1.0 - t**2)
+        return np.concatenate([t, bent * s * x[..., None], bent, np.ones((*x.shape, 1))], axis=2)
 
 
 FRICTION: Mapping[str, Callable[[int, int], FrictionModel]] = {
@@ -248,7 +227,8 @@ class FrictionLearner:
         times, limit = self.window.times[1:-1], self.limits.velocity
         within = (v + times[:, None] * a) / limit
         x = within if rates is None else rates[1:] / limit
-        moving = (np.abs(x).min(axis=0) > SLOW) & (np.abs(np.sign(x).sum(axis=0)) == len(x))
+        way = np.sign(x.sum(axis=0))
+        moving = ((x * way).min(axis=0) > SLOW) & ((within * way).min(axis=0) > STUCK)
         within = within.T
         weights = self.window.weights[1:-1]
         parameters = self.mean[:, : self.p]

@@ -324,15 +324,15 @@ class Identifiability:
     def of(cls, unknowns: Unknowns, motion: Motion, rate: float) -> Identifiability:
         """Examine a motion, of which each torque is measured at a rate [Hz]."""
         rows = unknowns.weighted(motion, rate).reshape(-1, len(unknowns))
-        null, alone = _null_space(rows)
+        null, alone, sizes = _null_space(rows)
         basis = _sparse(null)
-        touched = np.abs(basis).max(axis=0, initial=0.0) > SMALL
+        touched = basis.any(axis=0)
         weak = [
             f"{one.name} ({100.0 * error:.0f} %)"
             for one, error, is_null in zip(unknowns.parameters, alone, touched, strict=True)
             if error > WEAK and not is_null
         ]
-        return cls([_words(row, unknowns) for row in basis], weak)
+        return cls([_words(row / sizes, unknowns) for row in basis], weak)
 
 
 def count_null(unknowns: Unknowns, motion: Motion) -> int:
@@ -340,10 +340,11 @@ def count_null(unknowns: Unknowns, motion: Motion) -> int:
     return len(_null_space(unknowns.weighted(motion, 1.0).reshape(-1, len(unknowns)))[0])
 
 
-def _null_space(rows: Array) -> tuple[Array, Array]:
-    """Return the combinations that rows (N, p) do not see, (k, p), and errors of the rest, (p,).
+def _null_space(rows: Array) -> tuple[Array, Array, Array]:
+    """Return the combinations that rows (N, p) do not see, (k, p), errors of the rest, and sizes.
 
-    Columns have one size while the rank is decided, and the largest part of a combination is 1.
+    The parts of a combination are multiplied by the sizes of their columns, (p,), or 1 for 0: what
+    counts is their effect.
     """
     sizes = np.linalg.norm(rows, axis=0)
     dead = sizes <= NULL * sizes.max()  # of columns that rounding alone fills
@@ -351,9 +352,8 @@ def _null_space(rows: Array) -> tuple[Array, Array]:
     _, values, vectors = np.linalg.svd(np.linalg.qr(rows / sizes, mode="r"))
     sizes[dead] = 1.0
     lost = values <= NULL * values[0]
-    null = vectors[lost] / sizes
     alone = np.linalg.norm(vectors[~lost].T / values[~lost], axis=1) / sizes
-    return null / np.abs(null).max(axis=1, keepdims=True), alone
+    return vectors[lost], alone, sizes
 
 
 def relative_errors(information: Array) -> Array:
@@ -397,8 +397,7 @@ def _sparse(rows: Array) -> Array:
 
 def _words(row: Array, unknowns: Unknowns) -> str:
     """Return a null direction in words: what cannot be told apart."""
-    row = row / np.abs(row).max()
-    parts = [i for i in np.argsort(-np.abs(row), kind="stable") if abs(row[i]) > SMALL]
+    parts = [i for i in np.argsort(-np.abs(row), kind="stable") if row[i]]
     if len(parts) == 1:
         return f"{unknowns.names[parts[0]]} has no effect"
     shown = unknowns.scales * row

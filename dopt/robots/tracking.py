@@ -9,13 +9,20 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, KnownBody
 from dopt.robots.limits import Limits
+from dopt.robots.windows import ENCODER
 from dopt.types import Array
 
-BANDWIDTH = 40.0
-"""Natural frequency of errors of tracking [rad/s]; they are damped critically."""
+JITTER = 0.003
+"""Standard deviation of torques that steps of encoders make, as a part of the limit."""
 
-CORRECTION = 0.5, 0.1
-"""Parts of an innovation that correct the observed position, and the rate times dt."""
+FAST = 0.3, 0.65
+"""Least and most of the observer's error that a period of control removes."""
+
+FOLLOWED = 0.27
+"""Bandwidth of tracking by the observer's; errors are damped critically."""
+
+BANDWIDTH = 75.0
+"""Largest natural frequency of errors of tracking [rad/s]."""
 
 APART, SEEN = 0.01, 0.03
 """Distance that bodies keep, for errors of tracking, and from which they are looked at [m]."""
@@ -54,6 +61,7 @@ class Tracker:
         self.known, self.limits, self.friction, self.dt = known, limits, friction, dt
         self.q: Array = np.array(known.body.home)
         self.v: Array = np.zeros(len(self.q))
+        self._fast: Array = np.full(len(self.q), FAST[0])
 
     def place(self, q: Array) -> None:
         """Begin at rest at a position, (n,)."""
@@ -66,23 +74,39 @@ class Tracker:
 
     def correct(self, q: Array) -> None:
         """Correct the observed state by a measured position, (n,)."""
-        missed, (of_position, of_rate) = q - self.q, CORRECTION
-        self.q = self.q + of_position * missed
-        self.v = self.v + of_rate / self.dt * missed
+        missed, kept = q - self.q, 1.0 - self._fast
+        self.q = self.q + (1.0 - kept**2) * missed
+        self.v = self.v + self._fast**2 / self.dt * missed
 
     def torque(self, q: Array, v: Array, a: Array) -> Array:
-        """Return torques [N m], (n,), that follow a reference, within their limits."""
-        wanted = a + BANDWIDTH**2 * (q - self.q) + 2.0 * BANDWIDTH * (v - self.v)
-        demand = self.known.inverse(self.q, self.v, wanted) + self.friction(v)
+        """Return torques [N m], (n,), that follow a reference, within their limits.
+
+        Errors push their own joint alone: one that sticks would else push the others ahead.
+        """
+        rigid = self.known.inverse(self.q, self.v, a)
+        stiffness, damping = self._gains()
+        pushed = stiffness * (q - self.q) + damping * (v - self.v)
+        demand = rigid + self.friction(v) + pushed
         return np.minimum(np.maximum(demand, -self.limits.torque), self.limits.torque)
+
+    def _gains(self) -> tuple[Array, Array]:
+        """Return stiffness and damping, (n,), where the known body is, and pace the observer.
+
+        The lighter a joint is for its torque, the less the steps of its encoder shake it.
+        """
+        inertia = self.known.apparent_inertia()
+        jitter = 2.0 * FOLLOWED * ENCODER / self.dt**2 * inertia
+        self._fast = np.clip(np.cbrt(JITTER * self.limits.torque / jitter), *FAST)
+        bandwidth = np.minimum(FOLLOWED * self._fast / self.dt, BANDWIDTH)
+        return inertia * bandwidth**2, 2.0 * inertia * bandwidth
 
     def lag(self, torque: Array) -> Array:
         """Return the error of position, (n,), that feeds back a torque [N m], (n,).
 
         A reference that is moved back by what a better feedforward makes up for does not hurry.
         """
-        fed: Array = np.linalg.solve(self.known.mass_matrix(), torque).astype(float)
-        return fed / BANDWIDTH**2
+        result: Array = torque / self._gains()[0]
+        return result
 
 
 class Guard:

@@ -17,9 +17,8 @@ from orchestrate.files import whole, writing
 from orchestrate.program import UsageError, integer, path, positive, tell
 
 if TYPE_CHECKING:
-    from dopt.robots.body import Body, Motion
+    from dopt.robots.body import Motion
     from dopt.robots.design import Candidate, Design, Problem
-    from dopt.robots.limits import Limits
 
 SHOWN = 20
 """Rows of a list that are printed; --json has all."""
@@ -102,16 +101,9 @@ def _run(arguments: argparse.Namespace) -> ExitCode:
         noise=arguments.noise,
         rate=arguments.rate,
     )
-    head = _head(arguments.robot, body, limits)
+    head = {"robot": str(arguments.robot), "joints": list(body.joints)}
+    head |= {"notes": [*body.notes, *limits.notes]}
     return (_check if arguments.check else _design)(arguments, problem, head)
-
-
-def _head(robot: Path, body: Body, limits: Limits) -> dict[str, Any]:
-    return {
-        "robot": str(robot),
-        "joints": list(body.joints),
-        "notes": [*body.notes, *limits.notes],
-    }
 
 
 def _check(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]) -> ExitCode:

@@ -13,7 +13,7 @@ import pytest
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, Motion
 from dopt.robots.limits import Limits, check_weight
-from dopt.robots.parameters import Identifiability, Unknowns, relative_errors
+from dopt.robots.parameters import Identifiability, Unknowns, count_null, relative_errors
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
 
@@ -341,9 +341,27 @@ def test_wrong_parameters_are_named(arm: Body, limits: Limits, wanted: str, said
         Unknowns(arm, limits, wanted)
 
 
+def test_all_null_directions_are_said_beside_one_of_a_tiny_moment(tmp_path: Path) -> None:
+    """Masses, moments, friction and gears scale together: once that one of ten was lost."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint axis="0 1 0" range="-2 2" damping="0.05"/>
+        <inertial mass="0.26" pos="0 2e-6 0.08" diaginertia="1.2e-3 1.2e-3 3e-6"/>
+        <body pos="0 0.04 0.135"><joint axis="0 1 0" range="-2 2" damping="0.05"/>
+        <inertial mass="0.33" pos="0 1e-8 0.1" diaginertia="2.5e-3 2.5e-3 2e-6"/>
+        </body></body></worldbody></mujoco>"""
+    )
+    given = "joints: {default: {velocity: 4, acceleration: 30, torque: 3}}"
+    unknowns = Unknowns(body, limits_of(body, tmp_path, given), "all")
+    motion = random_motion(2, 200)
+    null = Identifiability.of(unknowns, motion, 100.0).null
+    assert len(null) == count_null(unknowns, motion)
+    assert any("gear" in text for text in null)
+
+
 FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>
 <link name="b"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="3" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+NEGATIVE = FLAT.replace('izz="3"', 'izz="-1"')
 
 
 @pytest.mark.parametrize(
@@ -352,6 +370,7 @@ FLAT = """<joint name="j" type="continuous"><parent link="a"/><child link="b"/><
         ("<mujoco><worldbody/></mujoco>", "no hinge or slide"),
         ("<mujoco><worldbody>", "cannot be read"),
         (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
+        (f'<robot name="r"><link name="a"/>{NEGATIVE}</robot>', "expected: correct it"),
         ("", "robot.xml"),
     ],
 )
@@ -384,9 +403,28 @@ def test_home_is_within_the_ranges_and_what_touches_there_is_named() -> None:
     assert away.notes == ()
     assert [pair for _, *pair in away.collisions(np.zeros((1, 2)))] == [["world", "fore"]]
     assert within.notes == (
-        "left out: contacts of bodies that touch where the file puts them: world and fore",
+        "left out: contacts less than 5 mm deeper than where the file puts them: world and fore",
     )
     assert within.collisions(np.zeros((1, 2))) == []
+
+
+def test_bodies_that_touch_at_home_may_touch_as_deep_and_no_deeper() -> None:
+    """Once they were not looked at, and a panda drove its wrist 49 mm into its forearm."""
+    body = body_of(
+        """<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1"/>
+        <body name="axle"><joint axis="0 0 1" range="-170 170"/>
+        <geom pos="0 0 0.11" size="0.03"/>
+        <body name="push" pos="0.12 0 0"><joint type="slide" axis="1 0 0" range="-0.05 0.2"/>
+        <geom size="0.03"/></body></body></worldbody></mujoco>"""
+    )
+    assert body.notes == (
+        "left out: contacts of bodies that touch in all positions: world and axle",
+        "left out: contacts less than 5 mm deeper than where the file puts them: world and push",
+    )
+    places = np.array([[0.0, 0.0], [0.0, -0.004], [0.0, -0.006], [0.0, 0.1]])
+    assert body.collisions(places) == [(2, "world", "push")]
+    assert Contacts(body, 0.01, 0.03).room(places[0]) == pytest.approx(0.001, abs=1e-6)
+    assert Contacts(body, 0.01, 0.03).room(places[1]) < 0.0
 
 
 def test_room_is_the_distance_beyond_the_one_to_keep() -> None:

@@ -98,6 +98,21 @@ def test_torque_limits_shorten_motions(arm: Body, limits: Limits) -> None:
     assert not one.free or problem.strain(one.motion(0.04)) <= 1.0 + 1e-9
 
 
+def test_viscous_friction_is_less_where_a_motion_is_slow(tmp_path: Path) -> None:
+    """Once it was the one at the limit of velocity, which no torque of a weak motor overcame."""
+    body = body_of(
+        """<mujoco><worldbody><body><joint name="j" axis="0 0 1" range="-2 2" damping="0.01"/>
+        <geom size="0.05" pos="0.1 0 0" mass="0.01"/></body></worldbody></mujoco>"""
+    )
+    given = "joints: {default: {velocity: 6, acceleration: 60, torque: 0.05}}"
+    weak = limits_of(body, tmp_path, given)
+    problem = Problem(body, weak, "damping", 5.0)
+    one = multisine(problem, np.random.default_rng(0))
+    fast = np.abs(one.motion(0.01).velocities).max()
+    assert one.free
+    assert fast < 5.0
+
+
 class Dip(Family):
     """Motion that is in the floor for 20 ms, between two rows of the search."""
 

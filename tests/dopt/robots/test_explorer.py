@@ -18,7 +18,7 @@ from dopt.robots.friction import SPEEDS
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard
 from studies.robots.online import LOOK, Trace, explore, true_values
-from studies.robots.simulated import SimulatedRobot, jaco
+from studies.robots.simulated import Friction, SimulatedRobot, jaco
 from tests.dopt.robots.test_body import body_of, limits_of
 
 Arm = Callable[[], tuple[Body, Limits]]
@@ -101,6 +101,56 @@ def test_limits_are_kept_and_friction_is_learned(arm: Arm, seed: int) -> None:
     assert np.median(trace.errors[-1]) < 0.1
     assert explorer.counts["changed"] == 0
     assert explorer.counts["windows"] == explorer.steps // explorer.learner.window.size
+
+
+LIGHT = """<mujoco><worldbody>
+  <body name="x"><joint name="x" type="slide" axis="1 0 0" range="-.6 .6"/>
+    <geom type="box" size=".1 .4 .05" mass="12"/>
+    <body pos="0 0 .2"><joint name="turn" axis="0 0 1" range="-170 170" armature="0.3"/>
+      <geom type="box" size=".3 .03 .03" pos=".3 0 0" mass="3"/>
+      <body pos=".65 0 0"><joint name="roll" axis="1 0 0" range="-170 170"/>
+        <geom type="box" size=".02 .05 .02" mass=".3"/></body></body></body>
+</worldbody></mujoco>"""
+
+
+def loose() -> tuple[Body, Limits]:
+    """Return a robot whose last joint is light, for its torque, and without armature."""
+    return Body(mujoco.MjModel.from_xml_string(LIGHT)), Limits(
+        position=np.array([[-0.6, 0.6], [-2.9, 2.9], [-2.9, 2.9]]),
+        velocity=np.array([1.0, 2.0, 3.0]),
+        acceleration=np.array([5.0, 8.0, 20.0]),
+        torque=np.array([120.0, 40.0, 1.0]),
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joints_that_are_light_for_their_friction_keep_their_limits(seed: int) -> None:
+    """Once they took 2.9 times their limits of velocity, where they stuck and broke loose."""
+    body, limits = loose()
+    random = np.random.default_rng(seed)
+    coulomb, size = random.uniform(0.05, 0.3, 3), limits.torque
+    friction = Friction(
+        coulomb * size,
+        random.uniform(0.01, 0.1, 3) * size / limits.velocity,
+        random.uniform(0.0, 0.4, 3) * coulomb * size,
+        random.uniform(0.01, 0.06, 3) * limits.velocity,
+        0.002 * limits.velocity,
+    )
+    robot = SimulatedRobot(body, limits, seed, friction=friction)
+    explorer = RobotExplorer(body, limits, seed=seed)
+    check_shares(explore(robot, explorer, 1.5), velocity=1.0)
+    assert (explorer.learner.windows > 2).all()
+
+
+def test_joints_without_armature_are_named() -> None:
+    body, limits = loose()
+    explorer = RobotExplorer(
+        body, dataclasses.replace(limits, torque=np.array([120.0, 40.0, 20.0]))
+    )
+    explorer.ask(np.zeros(3))
+    assert "as fast as it may: give the armature" in explorer.warnings[0]
+    assert "'roll'" not in explorer.warnings[0]
+    assert "turns roll as" in explorer.warnings[0]
 
 
 def test_references_keep_their_limits_exactly() -> None:
@@ -227,7 +277,8 @@ def test_the_step_of_torques_is_the_best_on_the_ball() -> None:
         idle = inverse @ (-bias - learner.torques(tracker.v))
         x = (tracker.v + explorer.dt * idle) / limits.velocity
         J = learner.model.jacobian(learner.mean[:, :p], x[:, None])[:, 0]
-        bent = learner.model.slopes(learner.mean[:, :p], x[:, None])[1][:, 0]
+        near = learner.model.jacobian(learner.mean[:, :p], x[:, None] + [-1e-5, 1e-5])
+        bent = (near[:, 1] - near[:, 0]) / 2e-5
         moved = explorer.dt * inverse @ u / limits.velocity
         rows = J + bent * moved[:, None]
         return float(np.einsum("np,npq,nq->", rows, learner.covariance[:, :p, :p], rows))

@@ -21,16 +21,11 @@ def test_derivatives_are_limits_of_differences(model: CoulombViscous | Network) 
     x = random.uniform(-1.0, 1.0, (3, 5))
     x[:, 0] = 0.002
     J = model.jacobian(parameters, x)
-    slopes, of_rows = model.slopes(parameters, x)
     for k in range(model.start.shape[1]):
         moved = np.zeros_like(parameters)
         moved[:, k] = step
         difference = model.torques(parameters + moved, x) - model.torques(parameters - moved, x)
         np.testing.assert_allclose(J[..., k], difference / (2 * step), atol=1e-6)
-    difference = model.torques(parameters, x + step) - model.torques(parameters, x - step)
-    np.testing.assert_allclose(slopes, difference / (2 * step), rtol=1e-4, atol=1e-6)
-    difference = model.jacobian(parameters, x + step) - model.jacobian(parameters, x - step)
-    np.testing.assert_allclose(of_rows, difference / (2 * step), rtol=1e-4, atol=2e-5)
 
 
 def test_a_window_is_exact_where_torque_accelerates_a_mass() -> None:
@@ -113,3 +108,12 @@ def test_slow_windows_teach_nothing() -> None:
     assert np.isfinite(slow[1])
     np.testing.assert_array_equal(learner.covariance[0], before[0])
     assert (learner.covariance[1] != before[1]).any()
+
+
+def test_a_joint_that_sticks_while_its_reference_moves_teaches_nothing() -> None:
+    """Once its torque counted as friction, which was learned too large and drove light joints."""
+    learner = FrictionLearner(limits(3), nothing)
+    rates = np.tile([0.2, 0.2, 0.2], (learner.window.size, 1))
+    means = np.zeros(3), np.array([0.004, 0.2, -0.2]), np.zeros(3), np.full(3, 5.0)
+    found = learner.learn(means, rates)
+    np.testing.assert_array_equal(np.isnan(found), [True, False, True])
