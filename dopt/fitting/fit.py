@@ -152,6 +152,7 @@ def fit(
     plant = measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
+    work.notes += [note for run in runs for note in run.notes if " outlier" in note]
     lengths = work.lengths(window)
     work.scan_delay(lengths[0])
     work.choose_window(lengths)
