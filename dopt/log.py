@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from dopt.errors import SpecificationError, suggestion, unknown_name
 from dopt.types import Array, Booleans
@@ -361,7 +362,8 @@ class Log:
       otherwise the clock was started again, and a new piece begins.
     - A 32-bit counter of µs or ms that begins again goes on.
     - A piece ends before a row without time or input, and at a gap.
-    - A missing measurement stays missing: its row is kept.
+    - A missing measurement stays missing: its row is kept. So does one that one or two rows long is
+      far from those around it, by what is usual there: an outlier, also of whole turns.
     - An angle measured within one turn is unwrapped; one that counts turns is kept.
     - A state without a column is left out of ``states``: a fit estimates it.
 
@@ -438,8 +440,12 @@ class Log:
         _note_missing(self.states, measured, notes)
         usable = np.isfinite(stamps) & np.isfinite(applied).all(axis=1)
         rows = _without_gaps(stamps, usable, gap, notes)
-        for i in map(self.states.index, angles):
-            measured[:, i] = _unwrapped(self.states[i], measured[:, i], rows, notes)
+        for i, name in enumerate(self.states):
+            period = TURN if name in angles else math.inf
+            measured[:, i] = _without_outliers(name, measured[:, i], rows, period, notes)
+            if name in angles:
+                measured[:, i] = _unwrapped(name, measured[:, i], rows, notes)
+                measured[:, i] = _without_outliers(name, measured[:, i], rows, math.inf, notes)
         start = stamps[rows[0][0]]
         if start:
             notes.append(f"Times count from the first usable stamp, {start:.10g} s.")
@@ -632,7 +638,7 @@ def _unwrapped(
     """Return an angle that is followed over the ends of a turn within each piece."""
     used = angle[np.concatenate(pieces)]
     used = used[np.isfinite(used)]
-    span = float(np.ptp(np.quantile(used, (0.001, 0.999)))) if used.size else 0.0  # but glitches
+    span = float(np.ptp(np.quantile(used, (0.01, 0.99)))) if used.size else 0.0  # but glitches
     if span > _ONE_TURN:
         notes.append(f"Angle {name!r} counts turns ({span / TURN:.3g} of them): it is kept.")
         return angle
@@ -647,6 +653,63 @@ def _unwrapped(
             f"{count_text(passes, 'time')}: unwrapped."
         )
     return found
+
+
+AROUND, NEAR = 5, 31
+"""Values from most of which an outlier is far, and those that say what is usual around it."""
+
+MOST_OUTLIERS = 0.02
+"""Share of values from which they are no outliers."""
+
+
+def outliers(values: Array, period: float = math.inf) -> Booleans:
+    """Return which values, (N,), are far from most of those around them.
+
+    Far is beyond 10 times the median second difference near, 1.5 times the median first one, which
+    an end stop turns, and 1.5 times the median change of the whole. Differences are taken within
+    half a period.
+    """
+    found = np.zeros(len(values), dtype=np.bool_)
+    there = np.flatnonzero(np.isfinite(values))
+    if len(there) < NEAR:
+        return found
+    y = values[there]
+
+    def turned(change: Array) -> Array:
+        return change if period == math.inf else change - period * np.round(change / period)
+
+    def around(part: Array, width: int) -> Array:
+        return sliding_window_view(np.pad(part, width // 2, mode="edge"), width)
+
+    def median(part: Array) -> Array:
+        return np.asarray(np.median(around(part, NEAR), axis=1))
+
+    first = turned(np.diff(y, prepend=y[0]))
+    second = np.abs(turned(np.diff(first, append=first[-1])))
+    apart = np.median(np.abs(turned(around(y, AROUND) - y[:, None])), axis=1)
+    moved = np.abs(first[first != 0.0])
+    usual = 10.0 * median(second) + 1.5 * median(np.abs(first))
+    usual += 1.5 * float(np.median(moved)) if len(moved) else 0.0
+    found[there] = apart > usual
+    return found
+
+
+def _without_outliers(
+    name: str,
+    values: Array,
+    pieces: Sequence[npt.NDArray[np.intp]],
+    period: float,
+    notes: list[str],
+) -> Array:
+    """Return a measured state with NaN in the place of outliers."""
+    rows = np.concatenate([each[outliers(values[each], period)] for each in pieces])
+    if not 0 < len(rows) <= MOST_OUTLIERS * len(values):
+        return values
+    kept = values.copy()
+    kept[rows] = np.nan
+    what = count_text(len(rows), "outlier")
+    notes.append(f"{what} of {name!r} left out, first row {rows[0]}: they stay missing.")
+    return kept
 
 
 def _note_missing(names: Sequence[str], measured: Array, notes: list[str]) -> None:

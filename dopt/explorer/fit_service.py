@@ -42,13 +42,15 @@ def _answer(request: Any) -> Found | Array | Samples:
 
 
 def _found(plant: Plant, log: Log, width: int, seed: int) -> Found:
-    chosen = fit(plant, log, width=width, seed=seed, weights=WEIGHTS, workers=1).chosen
+    found = fit(plant, log, width=width, seed=seed, weights=WEIGHTS, workers=1)
+    chosen = found.chosen
     values, s = chosen.model.values(chosen.solution.p), chosen.model.structure
     layout = s.feature_centers, s.feature_scales, values.sizes
     weights = np.empty(0)
     if chosen.model.width:
         weights = np.concatenate([part.ravel() for part in chosen.model.matrices(values.weights)])
-    return Found(values.constants, values.delay, values.lag, weights, *layout)
+    numbers = values.constants, values.delay, values.lag, weights
+    return Found(*numbers, *layout, found.plant.supply)
 
 
 def serve() -> None:

@@ -247,10 +247,10 @@ def is_event(event: Event, n_states: int, n_inputs: int) -> bool:
     if not entries or not event.keys() >= set(entries):
         return False
     with suppress(SpecificationError):
-        for entry in entries:
+        for entry in (*entries, *({"supply"} & event.keys())):
             if entry in _NAMES:
                 return event[entry] in _NAMES[entry]
-            if entry == "dt":
+            if entry in ("dt", "supply"):
                 within(entry, event[entry], math.inf)
             elif entry in ("rows", "renewed"):
                 whole(entry, event[entry], 1)

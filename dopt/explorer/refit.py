@@ -9,6 +9,7 @@ scaled numbers; both are affine in a state, so that the weights of one are the w
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import pickle
 import subprocess
@@ -105,6 +106,7 @@ class Found(NamedTuple):
     centers: Array  # (p,)
     scales: Array  # (p,)
     sizes: Array  # (r,)
+    supply: float = math.inf  # by which inputs are cut, where the plant declares none
 
     @property
     def fitted(self) -> list[float]:

@@ -5,17 +5,19 @@ row and each input the share of their squares is taken that the input of the eig
 explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a plant depends
 that answers at once. Estimated states depend on earlier inputs by their filter: of these there is
 no such test.
+
+Free runs over the last steps are predicted by the learned model, and by the known part alone.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from dopt.control.planning import predict
+from dopt.control.planning import predict, relative_error
 from dopt.explorer.journal import Event
 from dopt.learning import SimulationError
 from dopt.models.gaussian_process import GaussianProcess
@@ -27,7 +29,9 @@ from dopt.types import Array
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
     "late": "stretches of 300 steps whose errors follow from earlier inputs",
+    "worse": "tests in which free runs of the learned model were worse than of the known part alone",
     "altered": "learned steps in which another input was applied than was asked",
+    "supply": "fits that found a level beyond which inputs act no more",
     "out_of_scale": "learned accelerations of another size than a network learns",
     "beyond": "states beyond the limits",
     "narrow": "sides of the box of which the first 500 states cover less than a tenth",
@@ -46,6 +50,12 @@ from two tests, which take 2 ms each, to the next two."""
 
 LAGS = 8
 """Longest lag that is tested, in steps; tested steps follow so many others without a gap."""
+
+RUNS, AHEAD, TRIED = 8, 50, 500
+"""Free runs of a test, the steps of each, and steps from one test to the next."""
+
+WORSE = 1.25
+"""Error of the learned model, by the one of the known part, that is said."""
 
 EXPLAINED, OF_MOTION = 0.14, 0.25
 """Share of the squares of the errors, and its size beside the accelerations', that are said.
@@ -75,8 +85,14 @@ _TEXTS = {
     "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
     "once, or as declared: declare Plant(delay=..., lag=...), or let learner='simulation_error' "
     "fit them (dopt.unknown)",
+    "worse": "over the last steps, %d at a time, the learned model predicts with %.3g times the error "
+    "of the known part alone, but what is learned is expected to help: estimate the states with the "
+    "learner 'joint_ekf' or 'simulation_error', raise velocity_cutoff or the noise variance, or take "
+    "the model out",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
     "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
+    "supply": "inputs beyond %.3g act no more than that does, but all are expected to act as they were "
+    "asked: from here on they are cut there; declare Plant(supply=...), also if it is another one",
     "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
     "none is: raise their margin or steps, and check the known part",
     "narrow": "the first 500 states cover %.2g %% of the box along %s, but the model is to hold in "
@@ -127,6 +143,7 @@ class Signs:
         self._steps: list[tuple[int, float]] = []  # the start of each step, and its time
         self._models: list[Array] = []  # parameters at the beginning of each block of them
         self._rows: list[tuple[Array, ...]] = []  # of the next test
+        self._measured: list[Any] = []  # of the last steps, with the start of each
         self._told: set[str] = set()
 
     def restart(self, t: int) -> None:
@@ -143,10 +160,18 @@ class Signs:
             if limits.enforced:
                 self._say("beyond", state.excess[done - 1], done)
         self._steps.append((self._start, seconds))
+        self._measured.append((self._start, event["learn"]))
+        if done % TRIED == 0:
+            self._compare_runs(state)
         if done % BLOCK == 0:
             self._end_block(state)
         if done == AFTER:
             self._measure_box(state)
+
+    def find_supply(self, state: Exploration, level: float) -> None:
+        """Count a fit that found a supply which the plant does not declare."""
+        state.counts["supply"] += 1
+        self._say("supply", level)
 
     def _compare(self, change: Array, state: Exploration) -> None:
         """Count an input that was not applied as it was asked."""
@@ -177,6 +202,36 @@ class Signs:
             if sum(len(errors) for errors, *_ in self._rows) >= TESTED:
                 self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
                 self._rows = []
+
+    def _compare_runs(self, state: Exploration) -> None:
+        """Count where the learned model predicts the last measurements worse than without it."""
+        found, predicted = scaled(state.system), self._spec.model.predict
+        last, self._measured = self._measured[-RUNS * AHEAD :], []
+        starts, measured = zip(*last, strict=True)
+        first = state.done - len(last)
+        each = range(0, len(last) - AHEAD + 1, AHEAD)
+        at = [t for t in each if starts[t + AHEAD - 1] <= first + t]
+        if not at:
+            return
+        rows = np.array(at)[:, None] + np.arange(AHEAD)
+        x0, u = state.steps.states[first + rows[:, 0]], state.steps.inputs[first + rows]
+        seen = list(found.system.measured_states) or slice(None)
+        ends = found.of_states(np.array(measured), seen)[rows].swapaxes(0, 1)
+
+        def both(x: Array, u: Array) -> Array:  # the learned accelerations, and none
+            n = len(x) // 2
+            own = predicted(found.system, state.steps.parameters, x[:n], u[:n])
+            return np.concatenate([own, np.zeros_like(own)])
+
+        with np.errstate(all="ignore"):
+            reached = predict(found.system, both, np.tile(x0, (2, 1)), np.tile(u, (2, 1, 1)))
+        learned, known = (
+            relative_error(half[..., seen], ends, x0[:, seen])
+            for half in np.split(reached, 2, axis=1)
+        )
+        if known < np.inf and not learned <= WORSE * known:
+            state.counts["worse"] += 1
+            self._say("worse", AHEAD, learned / known)
 
     def _new_rows(self, state: Exploration) -> tuple[Array, ...]:
         """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).

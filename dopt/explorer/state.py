@@ -13,8 +13,9 @@ event                   meaning
 ``lost``                a state that could not be used, after which the present one is unknown
 ``counted``             something that changes nothing, by the name of its count
 ``refit``, ``fitted``,  parameters of the model, and values of the constants, delay and lag, that
-``rows``, ``beside``    a fit to so many rows has found; where it is so, the posterior of Gaussian
-                        processes with them is made beside the one in force
+``rows``, ``supply``,   a fit to so many rows has found, with the level at which inputs are cut where
+``beside``              it found one; or the posterior of Gaussian processes with them is made
+                        beside the one in force
 ``renewed``             that posterior, with the samples since, comes into force
 ======================  =====================================================================
 
@@ -351,7 +352,11 @@ class ExplorerState:
             return {**event, "beside": True} if beside and self.steps.evidence else event
         assert isinstance(self.spec.model, MLP)
         theta = found.parameters(self._scaled, self.spec.model.width, self.steps.parameters)
-        return {"refit": theta.tolist(), "fitted": found.fitted, "rows": rows}
+        event = {"refit": theta.tolist(), "fitted": found.fitted, "rows": rows}
+        assert isinstance(self.spec.system, ExploredPlant)
+        if found.supply < self.spec.system.plant.supply:
+            event["supply"] = found.supply
+        return event
 
     def _renew(self) -> None:
         evidence = self.steps.evidence
@@ -374,8 +379,13 @@ class ExplorerState:
         if isinstance(self.spec.learner, GaussNewton):
             self.steps.replace(np.array(event["refit"]), self._trial.plant.parameters)
             return
-        assert isinstance(self.system, ExploredPlant)
-        self.system = dataclasses.replace(self.system, fitted=tuple(event["fitted"]))
+        assert isinstance(self.spec.system, ExploredPlant)
+        system, plant = self.spec.system, self.spec.system.plant
+        if "supply" in event:  # which the plant did not declare
+            plant = dataclasses.replace(plant, supply=event["supply"])
+            system = plant.system(system.horizon, scaled=system.scaled)
+            self._signs.find_supply(self, event["supply"])
+        self.system = dataclasses.replace(system, fitted=tuple(event["fitted"]))
         self._scaled = scaled(self.system)
         self.steps.replace(np.array(event["refit"]), np.array(event["fitted"][:-2]))
         self.flight = self.flight.retimed(self.system)

@@ -5,7 +5,10 @@
    is kept.
 2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
-3. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
+3. A level is looked for at which the inputs are cut before they act. Where it predicts the held-out
+   blocks better, by more than one standard error or with a third less of what is minimised, all
+   begins again with it as the supply.
+4. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
    a network, by leaving out each window: the residuals inside are one curve.
 
 Blocks are logs, or equal parts of fewer than three logs. A held-out window is predicted from an
@@ -24,6 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError
@@ -77,6 +81,14 @@ MOST_SCANNED = 150
 
 ROWS_SCANNED = 8000
 """Rows of these windows."""
+
+CUTS = (0.95, 0.85)
+"""Levels of the largest input that are tried first as the supply."""
+
+LOWEST_CUT = 0.4
+
+LEAST_FALL, SURE_FALL = 0.1, 1.0 / 3.0
+"""Falls of what is minimised, by itself, from which a supply is looked for, and is beyond doubt."""
 
 STEP_ERROR = 0.3
 """Largest error of the integration that goes unsaid, in standard deviations of what is left."""
@@ -140,13 +152,25 @@ def fit(
     plant = measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
+    work.notes += [note for run in runs for note in run.notes if " outlier" in note]
     lengths = work.lengths(window)
     work.scan_delay(lengths[0])
     work.choose_window(lengths)
+    network = work.choose_network(width, weights, seed) if width else None
+    level = work.supply(*(network or (work.model, work.solution, 1.0)))
+    if level is not None:
+        again = dataclasses.replace(plant, supply=level)
+        options: Any = {"hold": hold, "window": window, "weights": weights, "seed": seed}
+        options |= {"width": width, "workers": workers, "progress": progress}
+        result = fit(again, runs, validate=tests or None, **options)
+        note = (
+            f"inputs beyond {level:g} act no more than {level:g} does: they count as cut there, as "
+            f"by supply={level:g}; declare the supply, also if it is another one"
+        )
+        result.selection = result.selection._replace(notes=(note, *result.selection.notes))
+        return result
     physics = work.finish(work.model, work.solution, 1.0)
-    chosen = physics
-    if width and (found := work.choose_network(width, weights, seed)) is not None:
-        chosen = work.finish(*found)
+    chosen = work.finish(*network) if network else physics
     work.check_steps(chosen)
     held_out = work.held_out()
     return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
@@ -325,16 +349,43 @@ class _Selection:
                 break
             best = float(scores.mean()), (start, s, scores, folds)
         start, s, scores, folds = best[1]
-        gain = self._scores - scores
-        error = float(gain.std(ddof=1) / math.sqrt(len(gain))) if len(gain) > 1 else math.inf
-        if not gain.mean() > error:
+        gain, error = _gain(self._scores, scores)
+        if not gain > error:
             self.notes.append(
-                f"no network: it lowers the loss on held-out blocks by {gain.mean():.3f} ± "
-                f"{error:.3f} only"
+                f"no network: it lowers the loss on held-out blocks by {gain:.3f} ± {error:.3f} "
+                f"only"
             )
             return None
-        self._folds["model"] = (model, folds)
+        self._folds["model"], self._scores = (model, folds), scores
         return model, start, s
+
+    def supply(self, model: Model, found: Solution, s: float) -> float | None:
+        """Return the level at which all inputs are cut, if held-out blocks say that they are."""
+        given, largest = self.data.inputs, float(np.abs(self.data.inputs).max())
+        if self.plant.supply < math.inf or not largest:
+            return None
+
+        def cut_at(share: float) -> Solution:
+            cut = np.clip(given, -share * largest, share * largest)
+            simulator = Simulator(model, self.data._replace(inputs=cut))
+            return solve(simulator, found.windows, found.p, s, most=12, scale=found.scale)
+
+        def cost(share: float) -> float:
+            return cut_at(share).cost(model, s)
+
+        uncut = found.cost(model, s)
+        if min(map(cost, CUTS)) > (1.0 - LEAST_FALL) * uncut:
+            return None
+        options = {"xatol": 0.01}
+        best = minimize_scalar(cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options=options)
+        level, whole = float(f"{best.x * largest:.3g}"), cut_at(best.x)
+        self.data = self.data._replace(inputs=np.clip(given, -level, level))
+        scores, _ = self._validate(model, whole, s)
+        self.data = self.data._replace(inputs=given)
+        self._note(f"inputs cut at {level:g}", scores)
+        gain, error = _gain(self._scores, scores)
+        is_sure = best.fun < (1.0 - SURE_FALL) * uncut
+        return level if gain > (0.0 if is_sure else error) else None
 
     def _tested(self, seconds: float, block: int, horizon: float | None = None) -> Integers:
         """Return first row, last row of the history, and last row of held-out predictions."""
@@ -443,6 +494,13 @@ class _Selection:
                 f"simulations differ by {most:.2g} standard deviations of what is left; declare a "
                 f"smaller dt, or softer corners, such as tanh(rate / 0.5) for tanh(rate / 0.05)"
             )
+
+
+def _gain(before: Array, after: Array) -> tuple[float, float]:
+    """Return the mean fall of the held-out losses of the blocks, and its standard error."""
+    fall = before - after
+    error = float(fall.std(ddof=1) / math.sqrt(len(fall))) if len(fall) > 1 else math.inf
+    return float(fall.mean()), error
 
 
 def latest_effect(plant: Plant, delay: float, step: float) -> float:

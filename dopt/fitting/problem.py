@@ -242,6 +242,11 @@ class Solution(NamedTuple):
     steps: int
     converged: bool
 
+    def cost(self, model: Model, s: float) -> float:
+        """Return what was minimised, with the prior of all deviations 1."""
+        prior = np.sum((self.p - model.prior) ** 2)
+        return float(robust(self.squares, self.scale).sum() / s**2 + prior)
+
 
 def robust(squares: Array, scale: Array) -> Array:
     """Return ρ of each window."""

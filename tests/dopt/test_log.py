@@ -212,6 +212,35 @@ def test_a_glitch_is_no_turn() -> None:
     assert said(found, "passes its end")
 
 
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("size", [3.0, TURN])
+def test_wrong_readings_of_an_encoder_are_left_out(size: float, wrapped: bool) -> None:
+    """One or two rows long, up to whole turns, which a wrapped angle does not see."""
+    t = 0.01 * np.arange(4000)
+    angle = 8.0 * np.sin(2.0 * t) + 3.0 * np.sin(5.0 * t)
+    wrong = np.random.default_rng(0).choice(np.arange(5, 3990, 10), 20, replace=False)
+    wrong[10] = wrong[9] + 1
+    read = angle.copy()
+    read[wrong] += size
+    read = np.round(read * 2000 / TURN) * TURN / 2000
+    read = read % TURN if wrapped else read
+    found = log({"t": t, "th": read, "u": t}, angles=["th"])
+    got = found.pieces[0].measured[:, 0]
+    seen = np.isfinite(got)
+    np.testing.assert_allclose(np.ptp((got - angle)[seen]), 0.0, atol=0.01)
+    if size < TURN or not wrapped:
+        assert set(np.flatnonzero(~seen)) == set(wrong)
+        assert said(found, "20 outliers of 'th' left out")
+
+
+def test_a_motion_with_corners_and_noise_has_no_outliers() -> None:
+    rng, t = np.random.default_rng(0), np.arange(3000.0)
+    for noise in (0.0, 0.1):
+        for motion in (np.abs(t % 40 - 20), np.sign(np.sin(0.03 * t)), np.floor(0.05 * t), 0.0 * t):
+            found = log({"t": t, "th": motion + noise * rng.normal(size=3000), "u": t})
+            assert not said(found, "outlier")
+
+
 def test_counts_become_radians_and_counters_go_on() -> None:
     angle = 30.0 * np.sin(2 * T)
     counts = np.round(angle / TURN * 4096).astype(np.int64)

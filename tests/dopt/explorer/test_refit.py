@@ -100,6 +100,22 @@ def test_a_network_is_fitted_beside_while_samples_are_filtered(tmp_path: Path) -
     assert missed[0] < 0.7 * missed[400]
 
 
+def test_a_supply_that_is_not_declared_is_found_and_replayed(tmp_path: Path) -> None:
+    plant = dataclasses.replace(PLANT, constants={"gain": 5.0})
+    given: dict[str, Any] = {"policy": "d_optimal", "journal": tmp_path / "run.jsonl"}
+    rig = Rig(1.5, 0.03, supply=4.0, substeps=20)
+    with explorer(plant, **given) as one:
+        drive(one, rig, 300)
+        assert one.counts["supply"] >= 1
+        asked = one.ask(rig.x, rig.time)
+        assert abs(asked[0]) == pytest.approx(4.0, rel=0.05)
+        before = one.counts, one.parameters.copy(), one.constants
+    with explorer(plant, **given) as again:
+        assert (again.counts, again.constants) == (before[0], before[2])
+        np.testing.assert_array_equal(again.parameters, before[1])
+        np.testing.assert_array_equal(again.ask(rig.x, rig.time), asked)
+
+
 KILLED = """
 import sys
 from tests.dopt.explorer.test_refit import drive, explorer, late_rig

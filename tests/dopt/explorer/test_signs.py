@@ -114,6 +114,22 @@ def test_inputs_that_nobody_asked_for_are_not_altered(tmp_path: Path) -> None:
             assert one.counts["altered"] <= 2
 
 
+def test_a_model_that_is_worse_than_the_known_part_is_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Of a plant that is as it is known, the noise is learned."""
+    for pull in (0.0, 8.0):
+        with explorer(steps=STEPS) as one:
+            rng, x = np.random.default_rng(0), np.array([0.1, 0.0])
+            for _ in range(STEPS):
+                u = one.ask(x)
+                x = x + MOTOR.dt * np.array([x[1], 5.0 * u[0] - pull * np.sin(x[0])])
+                x += 0.03 * rng.normal(0.0, [0.1, 1.0])
+                one.tell(x)
+            assert one.counts["worse"] == (pull == 0.0)
+    assert ["times the error of the known part alone" in text for text in said(caplog)] == [True]
+
+
 def test_states_in_a_small_part_of_the_box_are_said(caplog: pytest.LogCaptureFixture) -> None:
     with explorer(steps=STEPS) as one:
         x = np.array([0.1, 0.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from pathlib import Path
@@ -280,6 +281,20 @@ def test_standard_errors_are_of_fits_without_each_window() -> None:
     ]
     squares = np.sum(np.square(np.array(left_out) - p), axis=0)
     np.testing.assert_allclose(np.diag(covariance), squares, rtol=0.01)
+
+
+@pytest.mark.parametrize("supply", [1.7, math.inf])
+def test_a_supply_that_is_not_declared_is_found(supply: float) -> None:
+    """What is cut is seen where the effect of the input is known."""
+    plant, table = declared(), run(2)
+    constants = {**plant.constants, "gain": TRUE[0]}
+    t, u = (table[name].to_numpy() for name in ("time", "voltage"))
+    x = truth(t, np.clip(u, -supply, supply), 0.02, 0.0, np.zeros(2), TRUE)
+    found = dopt.fit(
+        dataclasses.replace(plant, constants=constants), table.assign(angle=x[:, 0]), width=0
+    )
+    assert found.plant.supply == pytest.approx(supply, rel=0.03)
+    assert ("inputs beyond" in found.report()) == (supply < math.inf)
 
 
 def test_a_network_is_refused_where_the_constants_tell_all() -> None:
