@@ -118,7 +118,7 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
     end = len(states) - 1
     if end < 1:
         raise AnalysisError(f"{name} diverged at its first steps: choose another with --seed.")
-    seen = rerun(spec, np.unique(np.linspace(0, end, frames).round().astype(int)).tolist())
+    seen = rerun(spec, np.unique(np.linspace(end, 0, frames).round().astype(int)).tolist())
     if not np.allclose(seen.states[: end + 1], states, rtol=1e-6, atol=1e-9):
         raise AnalysisError(
             f"{name} runs another way here than when it was stored, so what its model knew is not "

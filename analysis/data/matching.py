@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -90,7 +91,8 @@ class Filter:
         """Raise AnalysisError for a condition that no stored configuration meets."""
         flat = [flatten(config.config) for config in configs]
         for path, value in self.where.items():
-            stored = {json.dumps(entry[path]) for entry in flat if path in entry}
+            found = {json.dumps(entry[path]): entry[path] for entry in flat if path in entry}
+            stored = sorted(found, key=lambda text: (_size(found[text]), text))
             if not stored:
                 near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
                 raise AnalysisError(
@@ -101,8 +103,12 @@ class Filter:
                 text = json.dumps(value, default=str)
                 raise AnalysisError(
                     f"--where {path}={text} fits no stored configuration, "
-                    f"stored are {', '.join(sorted(stored))}: choose one of these."
+                    f"stored are {', '.join(stored)}: choose one of these."
                 )
+
+
+def _size(value: object) -> float:
+    return value if isinstance(value, int | float) else math.inf
 
 
 def read_condition(text: str) -> tuple[str, object] | None:

@@ -217,11 +217,11 @@ def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFra
 
 def nothing_to_compare(selection: Selection) -> AnalysisError:
     """Return the error for a selection without a pair of simulated trials."""
-    selected = f"only {', '.join(selection.labels)}" if selection.labels else "no simulated trial"
+    selected = ", ".join(selection.labels) or "no simulated trial"
     return AnalysisError(
-        f"A comparison needs trials of the reference {selection.reference} and of another "
-        f"variant in one environment, but {selected} is selected: run the others, ask wider, "
-        f"or choose another --reference."
+        f"A comparison needs trials of the reference {selection.reference} and of another variant "
+        f"that are done, of one environment and seed, but the selection ({selected}) has none: run "
+        f"them, ask wider, or choose another --reference."
     )
 
 

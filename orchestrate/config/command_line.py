@@ -19,6 +19,7 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -55,8 +56,8 @@ _OPTIONS = (
 )
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
-_UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
-"""Path with a character that Hydra takes in quotes alone."""
+_UNQUOTED = re.compile(r"(?s)(?!null$)[^'\"](?:(?!,\w+://).)*")
+"""Database URL that may hold a character which Hydra takes in quotes alone; not several."""
 
 _CHOICE = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>null|\[.*\]|)\s*")
 _OF_TRIALS = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
@@ -187,11 +188,11 @@ def _check_choice(word: str) -> None:
 
 
 def _quoted(word: str) -> str:
-    """Return ``launch.until=ci<5%`` or a path with the quotes that Hydra requires around them."""
+    """Return ``launch.until=ci<5%`` or a URL with the quotes that Hydra requires around them."""
     key, _, value = word.partition("=")
     rule = key.lstrip("+") == "launch.until" and value.startswith("ci")
     if rule or (key.lstrip("+") == "store.url" and _UNQUOTED.fullmatch(value)):
-        return f"{key}='{value}'"
+        return f"{key}={QuotedString(value, Quote.single).with_quotes()}"
     return word
 
 

@@ -225,7 +225,8 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
     options = loader.get_group_options(override.key_or_group, results_filter=None)
     if options and not any(isinstance(value, dict) for value in values):
         if None in values:
-            raise unknown_name(override.key_or_group, "null", options)
+            names = _every_option(loader, override.key_or_group)
+            raise unknown_name(override.key_or_group, "null", names)
         return Axis(key, texts, values, "choice")
     scalar = override.type == OverrideType.CHANGE and override.package is None
     return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
