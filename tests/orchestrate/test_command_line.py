@@ -116,7 +116,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "\\+env\\.mass="),
         (["env=[arm,cartpole]"], "env is the list \\[arm,cartpole\\], .*-m env=a,b"),
         (["-m", "env=null,arm"], "env 'null' is unknown"),
-        (["-m", "~policy"], "policy 'null' is unknown: choose one of baseline/chirp, .*, random, uniform"),
+        (["-m", "~policy"], "policy 'null' is unknown: choose one of baseline/chirp, "),
         (["pendulum"], "'pendulum' is not an override: write key=value"),
         (["seed=abc"], "seed is 'abc', but a whole number"),
         (["seed=1.5"], "seed is 1.5, but a whole number"),
@@ -605,7 +605,7 @@ def test_a_database_in_the_home_folder(
 
 
 @pytest.mark.parametrize(
-    "name", ["it's \"ü\" (b).db", "[x]{y},z=1.db", "b~ a.db", "größe/100%25 %3F.db"]
+    "name", ['it\'s "ü" (b).db', "[x]{y},z=1.db", "b~ a.db", "größe/100%25 %3F.db"]
 )
 def test_a_database_of_any_name(command_line: Command, tmp_path: Path, name: str) -> None:
     url = f"sqlite:///./{name}"
