@@ -211,7 +211,8 @@ def aggregate_table(table: pd.DataFrame) -> TextTable:
     note = (
         f"Ratio: {_RATIO}; geometric mean over systems, each counted alike, of the geometric mean "
         "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
-        "stratified by system, Student's below 30 pairs of a system. Compare only rows of the same systems. Diverged trials are left out."
+        "stratified by system, Student's below 30 pairs of a system. Compare only rows of the "
+        "same systems. Diverged trials are left out."
     )
     return rendered(table, columns, note)
 
