@@ -27,9 +27,9 @@ from analysis.data.selection import Entry, Selection
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
 from dopt.assessment import TURN, Plane, turns, wrap
 from dopt.spec.trial import is_prequential, system_of
+from dopt.types import Array, Integers
 from orchestrate.store import Reader
 
-Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.integer[Any]]
 
 CONFIDENCE = 0.95
@@ -365,7 +365,7 @@ def band_limits(bands: Sequence[Band]) -> Limits:
     return log_limits(np.concatenate([means, edges[edges > low / 3]]))
 
 
-def log_limits(values: npt.NDArray[np.float64], margin: float = 1.15) -> tuple[float, float]:
+def log_limits(values: Array, margin: float = 1.15) -> tuple[float, float]:
     """Return limits around the positive, finite ones of some values; (0.1, 1) for none."""
     usable = values[np.isfinite(values) & (values > 0)]
     if not len(usable):
@@ -384,8 +384,8 @@ class LossCurve:
     policy: str
     label: str
     style: LineStyle
-    t: npt.NDArray[np.int64]
-    x: npt.NDArray[np.float64]
+    t: Integers
+    x: Array
     unit: str
     band: Band
     statistic: Statistic

@@ -15,7 +15,6 @@ from dataclasses import asdict
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import AnalysisError, nearness
@@ -33,9 +32,9 @@ from analysis.stats.scores import (
     mean_losses,
     steps_to,
 )
+from dopt.types import Array
 from orchestrate.store import Reader
 
-Array = npt.NDArray[np.float64]
 BySeed = Mapping[int, float]
 Score = Callable[[Reader, Entry, str], Scores]
 

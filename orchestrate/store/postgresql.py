@@ -30,6 +30,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
+from dopt.types import Array
 from orchestrate.errors import StoreError, StoreUnavailableError
 from orchestrate.store.backend import (
     ANNOUNCE_SECONDS,
@@ -41,7 +42,7 @@ from orchestrate.store.backend import (
     log,
     public_url,
 )
-from orchestrate.store.records import Array, finite_list
+from orchestrate.store.records import finite_list
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
 
 if TYPE_CHECKING:

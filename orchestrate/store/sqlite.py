@@ -38,6 +38,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.pool import QueuePool
 
+from dopt.types import Array
 from orchestrate.errors import (
     DatabaseMovedError,
     NoDatabaseError,
@@ -57,7 +58,6 @@ from orchestrate.store.backend import (
     sqlite_path,
     translated_file,
 )
-from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, VIEWS, trial
 
 MOUNT_TABLE = Path("/proc/self/mountinfo")
