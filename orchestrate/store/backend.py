@@ -402,8 +402,7 @@ class Backend(ABC):
     def back_up(self, connection: Connection, version: int) -> str:
         """Copy the database of the given version to a new file and return its path."""
 
-    @abstractmethod
-    def exclusive(self, connection: Connection) -> None:
+    def exclusive(self, connection: Connection) -> None:  # noqa: B027  one writer is alone
         """Keep other launches from registering or recovering until the transaction ends."""
 
     @abstractmethod
@@ -429,9 +428,8 @@ class Backend(ABC):
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:
         """Mark a new launch as alive, before others can see it."""
 
-    @abstractmethod
-    def renew(self, connection: Connection, launch_id: int) -> None:
-        """Extend the life of the launch."""
+    def renew(self, connection: Connection, launch_id: int) -> None:  # noqa: B027  a lock has none
+        """Extend the lease of the launch."""
 
     @abstractmethod
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
@@ -441,12 +439,10 @@ class Backend(ABC):
         """Return a unique name for a launch of this process."""
         return uuid.uuid4().hex
 
-    @abstractmethod
-    def evict(self) -> None:
+    def evict(self) -> None:  # noqa: B027  the kernel releases the locks of a dead process
         """End the transactions of dead launches, which could keep their locks forever."""
 
-    @abstractmethod
-    def forget(self, token: str) -> None:
+    def forget(self, token: str) -> None:  # noqa: B027  a lease expires by itself
         """Delete the lock of a launch that has ended or died."""
 
     @abstractmethod

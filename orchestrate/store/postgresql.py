@@ -235,9 +235,6 @@ class PostgreSQLBackend(Backend):
         with self.transaction() as connection:
             _end_dead(connection)
 
-    def forget(self, token: str) -> None:
-        """Do nothing: a lease expires by itself."""
-
     def close(self) -> None:
         self.engine.dispose()
 
