@@ -62,9 +62,13 @@ def _run(options: argparse.Namespace) -> int:
         selection = select(reader, wanted(options))
         if selection.gaps and not options.allow_partial:
             raise incomplete(selection.gaps, "a complete grid is", "--env and --policy")
-        for note in selection.notes:
-            tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
+        _say_notes(selection)
         return int(options.run(reader, selection, options))
+
+
+def _say_notes(selection: Selection) -> None:
+    for note in selection.notes:
+        tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
 
 
 def parser() -> Parser:
@@ -136,8 +140,9 @@ def parser() -> Parser:
     animate = commands.add_parser("animate", help=film, description=film)
     animate.set_defaults(alone=_animate)
     add_database(animate)
-    animate.add_argument("env", metavar="ENV", help="environment of the trial")
-    animate.add_argument("policy", metavar="POLICY", help="policy of the trial")
+    animate.add_argument("env", metavar="ENV", nargs=1, help="environment of the trial")
+    animate.add_argument("policy", metavar="POLICY", nargs=1, help="policy of the trial")
+    _add_where(animate)
     animate.add_argument("--seed", type=int, help="seed (default: of the median final loss)")
     animate.add_argument("--out", type=path("--out"), help=".gif or .mp4 (figures/ENV_POLICY.gif)")
     for option, default, what in (("--frames", 150, "pictures in all"), ("--fps", 15, "a second")):
@@ -170,6 +175,11 @@ def add_selection(command: Parser) -> None:
     """Add the options that select trials."""
     command.add_argument("--env", nargs="+", default=(), help="only these environments")
     command.add_argument("--policy", nargs="+", default=(), help="only these policies")
+    _add_where(command)
+    command.add_argument("--allow-partial", action="store_true", help="go on without the missing")
+
+
+def _add_where(command: Parser) -> None:
     command.add_argument(
         "--where",
         nargs="+",
@@ -177,7 +187,6 @@ def add_selection(command: Parser) -> None:
         metavar="PATH=VALUE",
         help="only configurations with this value, such as model.width=32",
     )
-    command.add_argument("--allow-partial", action="store_true", help="go on without the missing")
 
 
 def add_database(command: Parser) -> None:
@@ -225,15 +234,17 @@ def _animate(options: argparse.Namespace) -> int:
     from analysis import film  # Matplotlib: other commands do without it
     from analysis.stats.curves import median_seed
 
-    name = f"{options.env}_{options.policy}.gif".replace("/", "_")
-    target = options.out or Path("figures") / name
+    (env,), (policy,) = options.env, options.policy
+    target = options.out or Path("figures") / f"{env}_{policy}.gif".replace("/", "_")
     with Reader.open(options.db) as reader:
-        entry = select(reader, Filter((options.env,), (options.policy,))).entries[0]
+        selection = select(reader, wanted(options))
+        _say_notes(selection)
+        [entry] = selection.entries
         losses = entry.final_losses()
         if options.seed is None and not losses:
             raise AnalysisError(
-                f"{options.env} × {options.policy} has no finished trial that did not diverge: "
-                f"run one, or give --seed."
+                f"{env} × {policy} has no finished trial that did not diverge: run one, or give "
+                f"--seed."
             )
         seed = median_seed(losses) if options.seed is None else options.seed
         story = film.tell(reader, entry, seed, options.frames)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -90,7 +91,8 @@ class Filter:
         """Raise AnalysisError for a condition that no stored configuration meets."""
         flat = [flatten(config.config) for config in configs]
         for path, value in self.where.items():
-            stored = {json.dumps(entry[path]) for entry in flat if path in entry}
+            found = {json.dumps(entry[path]): entry[path] for entry in flat if path in entry}
+            stored = sorted(found, key=lambda text: (_size(found[text]), text))
             if not stored:
                 near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
                 raise AnalysisError(
@@ -101,8 +103,12 @@ class Filter:
                 text = json.dumps(value, default=str)
                 raise AnalysisError(
                     f"--where {path}={text} fits no stored configuration, "
-                    f"stored are {', '.join(sorted(stored))}: choose one of these."
+                    f"stored are {', '.join(stored)}: choose one of these."
                 )
+
+
+def _size(value: object) -> float:
+    return value if isinstance(value, int | float) else math.inf
 
 
 def read_condition(text: str) -> tuple[str, object] | None:
@@ -285,14 +291,30 @@ def differing_paths(flat: Sequence[Mapping[str, Any]]) -> set[str]:
     return {path for path in paths if any(own.get(path) != first.get(path) for own in flat)}
 
 
-def check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
-    """Raise AnalysisError for a name that is not stored."""
-    for name in given:
-        if name not in stored:
+def accepted(reader: Reader, wanted: Filter) -> list[ConfigRow]:
+    """Return the stored configurations of the newest code that fit a request, at least one.
+
+    Raises AnalysisError for a name or a condition that is not stored, and where nothing fits.
+    """
+    configs = list(reader.configs())
+    for kind, given, column in (
+        ("environment", wanted.environments, "env"),
+        ("policy", wanted.policies, "policy"),
+    ):
+        stored = sorted({getattr(config, column) for config in configs})
+        for name in (one for one in given if one not in stored):
             raise AnalysisError(
                 f"The database has no trial of {kind} '{name}', "
-                f"choose one of {', '.join(sorted(stored)) or 'none: it is empty'}."
+                f"choose one of {', '.join(stored) or 'none: it is empty'}."
             )
+    wanted.check_where(configs)
+    found = newest([config for config in configs if wanted.accepts(config)])
+    if not found:
+        raise AnalysisError(
+            f"No configuration in {reader.safe_url} fits the request, "
+            f"it holds {len(configs)} in all: run the grid first, or ask for less."
+        )
+    return found
 
 
 def latest(reader: Reader, configs: list[ConfigRow]) -> list[ConfigRow]:

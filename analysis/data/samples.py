@@ -25,9 +25,9 @@ import pandas as pd
 from analysis.data.matching import (
     AnalysisError,
     Filter,
-    check_names,
+    accepted,
     choose,
-    latest,
+    latest_sources,
     read_condition,
 )
 from analysis.data.selection import Entry, environment_rank, policy_rank
@@ -37,6 +37,7 @@ from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
+from dopt.types import Array, Integers
 from orchestrate.store import (
     CONFIG_COLUMNS,
     ConfigRow,
@@ -45,8 +46,7 @@ from orchestrate.store import (
     default_url,
 )
 from orchestrate.store.records import stacked
-
-Array = npt.NDArray[np.float64]
+from orchestrate.store.schema import STEP_VALUES
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Sample:
     n_diverged : int
     """
 
-    seeds: npt.NDArray[np.int64]
+    seeds: Integers
     values: Array
     n_finished: int
     n_diverged: int
@@ -207,9 +207,6 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
     return stored_trial(configuration.config, seed)
 
 
-STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
-
-
 def read_request(env: object, policy: object, where: object) -> Filter:
     """Return the filter of a request; raise AnalysisError for arguments of another kind."""
     return Filter(
@@ -278,10 +275,10 @@ class Trajectories:
     inputs : (n, T, m)
     """
 
-    seeds: npt.NDArray[np.int64]
-    t: npt.NDArray[np.float64]
-    states: npt.NDArray[np.float64]
-    inputs: npt.NDArray[np.float64]
+    seeds: Integers
+    t: Array
+    states: Array
+    inputs: Array
 
 
 def load(
@@ -360,7 +357,7 @@ class Results:
         ``t`` is the step and ``time`` the same in seconds; after a divergence values are NaN.
         """
         return pd.concat(
-            [self._tidy(config, columns or STEP_COLUMNS) for config in self._configs()],
+            [self._tidy(config, columns or STEP_VALUES) for config in self._configs()],
             ignore_index=True,
         )
 
@@ -434,17 +431,7 @@ class Results:
         return found[0]
 
     def _configs(self) -> list[ConfigRow]:
-        configs = self.reader.configs()
-        check_names("environment", self._wanted.environments, {config.env for config in configs})
-        check_names("policy", self._wanted.policies, {config.policy for config in configs})
-        self._wanted.check_where(configs)
-        accepted = [config for config in configs if self._wanted.accepts(config)]
-        fitting = latest(self.reader, accepted)
-        if not fitting:
-            raise AnalysisError(
-                f"No configuration in {self.reader.safe_url} fits the request, "
-                f"it holds {len(configs)} in all: run the grid first, or ask for less."
-            )
+        fitting = latest_sources(self.reader, accepted(self.reader, self._wanted))
         return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
 
 

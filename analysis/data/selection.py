@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 
 from analysis.data.matching import (
     REFERENCE,
-    AnalysisError,
     Filter,
+    accepted,
     check_keys,
-    check_names,
     choose,
     choose_by,
     latest_sources,
     nearness,
-    newest,
     setting_value,
     source_notes,
 )
@@ -27,11 +25,10 @@ from dopt.policies import POLICIES, TITLES
 from dopt.spec.config import labels, limits_label, value_label
 from dopt.spec.trial import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS
-from orchestrate.store import ConfigRow, Reader, TrialRow
+from orchestrate.store import FINISHED, ConfigRow, Reader, TrialRow
 
 Compatible = Callable[[ConfigRow, ConfigRow], bool]
 _SECTIONS = ("env", "policy", "model", "learner")
-FINISHED = ("done", "diverged")
 
 ENVIRONMENTS = (
     *("pendulum", "cartpole", "arm", "quadrotor"),
@@ -255,24 +252,15 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     AnalysisError
         When nothing fits, a name is unknown, or several configurations fit equally well.
     """
-    configs = list(reader.configs())
-    check_names("environment", wanted.environments, {config.env for config in configs})
-    check_names("policy", wanted.policies, {config.policy for config in configs})
-    wanted.check_where(configs)
-    current = newest([config for config in configs if wanted.accepts(config)])
-    accepted = latest_sources(reader, current, wanted.group_by)
-    if not accepted:
-        raise AnalysisError(
-            f"No configuration in {reader.safe_url} fits the request, "
-            f"it holds {len(configs)} in all: run the grid first, or ask for less."
-        )
-    check_keys(wanted.group_by, accepted)
-    trials = {config.config_key: tuple(reader.trials(config.config_key)) for config in accepted}
+    current = accepted(reader, wanted)
+    stored = latest_sources(reader, current, wanted.group_by)
+    check_keys(wanted.group_by, stored)
+    trials = {config.config_key: tuple(reader.trials(config.config_key)) for config in stored}
     by_policy = wanted.group_by == ("policy",)
     chosen = (
-        choose(accepted, wanted.reference)
+        choose(stored, wanted.reference)
         if by_policy
-        else choose_by(accepted, wanted.group_by, wanted.reference)
+        else choose_by(stored, wanted.group_by, wanted.reference)
     )
     entries = tuple(
         labelled((Entry(config, trials[config.config_key]) for config in chosen), wanted.group_by)
@@ -280,8 +268,8 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     return Selection(
         entries,
         tuple(_gaps(entries, compatible if by_policy else None)),
-        (*omissions(accepted, chosen), *source_notes(current, chosen)),
-        tuple(labelled(Entry(config, trials[config.config_key]) for config in accepted)),
+        (*omissions(stored, chosen), *source_notes(current, chosen)),
+        tuple(labelled(Entry(config, trials[config.config_key]) for config in stored)),
         wanted.reference,
         wanted.group_by,
     )

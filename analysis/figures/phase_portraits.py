@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -52,9 +51,9 @@ from analysis.style import (
 from dopt.assessment import CELLS
 from dopt.spec.trial import system_of
 from dopt.systems.properties import eigenmode
+from dopt.types import Array
 from orchestrate.store import Reader
 
-Array = npt.NDArray[np.float64]
 SEED_RULE = "the seed whose D-optimal final loss is the median (the lower one of two)"
 PANEL_HEIGHT = 2.1
 MARGIN = 0.04

@@ -181,7 +181,7 @@ def _curves_table(state: ServerState, request: Request) -> Response:
 def _error_response(state: ServerState, request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         status = next(code for kinds, code in STATES if isinstance(error, kinds))
-        return _message(state, request, status, str(error))
+        return _message(state, request, status, str(error).replace("--where", "the field Where"))
     missing = "This page does not exist: choose a page from the menu above."
     sentence = missing if error.status_code == 404 else f"{error.detail}."
     return _message(state, request, error.status_code, sentence)

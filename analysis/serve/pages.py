@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import AnalysisError, latest
@@ -33,13 +32,13 @@ from analysis.style import policy_style
 from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError
 from dopt.explorer.signs import STORED
-from dopt.spec.config import completed, flatten, labels
+from dopt.spec.config import flatten, labels
 from dopt.spec.trial import is_fit, is_prequential, system_of
 from dopt.systems import System
 from dopt.systems.properties import eigenmode
-from orchestrate.store import ConfigRow, LaunchRow, QueryError, Reader, explorations, failure_kinds
+from dopt.types import Array
+from orchestrate.store import ConfigRow, LaunchRow, QueryError, Reader, failure_kinds, trial_report
 
-Array = npt.NDArray[np.float64]
 Content = dict[str, Any]
 
 SHADES = 9
@@ -98,18 +97,6 @@ FROM attempt GROUP BY launch_id
 _TRIAL = """
 SELECT v.*, c.config_json FROM v_trial v
 JOIN config c ON c.config_key = v.config_key WHERE v.trial_key = :trial_key
-"""
-_ATTEMPTS = """
-SELECT a.attempt, a.outcome, a.cause, a.launch_id, a.node, a.claimed, a.ended,
-       a.wall_seconds, a.peak_memory_bytes, e.type, e.traceback
-FROM attempt a LEFT JOIN error e ON e.error_id = a.error_id
-WHERE a.trial_id = :trial_id ORDER BY a.attempt
-"""
-_LAUNCHES = """
-SELECT launch_id, state, started, ended, host, pid, argv, git_commit, git_dirty, git_diff_hash,
-       versions
-FROM launch
-WHERE launch_id IN (SELECT launch_id FROM attempt WHERE trial_id = :trial_id) ORDER BY launch_id
 """
 _ASSESSED = """
 SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure
@@ -416,25 +403,21 @@ def trials(state: ServerState, params: QueryParams) -> Content:
 def trial(state: ServerState, params: QueryParams) -> Content:
     """Return everything that is stored of a trial except its arrays, see ``arrays``."""
     reader = state.database.reader()
-    row = _row(reader, params)
-    config = completed(json.loads(row.pop("config_json")))
+    found = trial_report(reader, _row(reader, params)["trial_id"])
+    row, config, saved = dict(found.trial), dict(found.config), found.exploration
     system = _system(config)
-    running = next((one for one in explorations(reader) if one.trial_key == row["trial_key"]), None)
-    launches = _table(reader, _LAUNCHES, row["trial_id"])
     fit = _fit(reader, row, config)
     return {
         "progress": read_progress(reader),
         "trial": row,
         "config": flatten(config),
-        "attempts": _table(reader, _ATTEMPTS, row["trial_id"]),
-        "launches": [
-            one | {name: json.loads(one[name]) for name in ("argv", "versions")} for one in launches
-        ],
+        "attempts": found.attempts,
+        "launches": found.launches,
         "assessments": [] if fit else _table(reader, _ASSESSED, row["trial_id"]),
         "fit": fit,
         "signs": STORED,
         "has_arrays": row["status"] in ("done", "diverged"),
-        "exploration": running and {"is_running": running.is_running, "state": running.state},
+        "exploration": saved and {"is_running": saved.is_running, "state": saved.state},
         "system_is_known": system is not None,
         "has_bounded_states": bool(system and bounded_states(config, system)),
         "legend_entry": legend_entry(row["policy"]),

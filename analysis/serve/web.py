@@ -20,7 +20,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response, StreamingResponse
@@ -31,6 +30,7 @@ from analysis.style import environment_title, number, plus_minus
 from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
 from orchestrate.store.backend import parse_url, public_url, read_login, sqlite_path
+from orchestrate.store.records import jsonable
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -121,26 +121,9 @@ def truncated(text: str, length: int = 60) -> str:
     return shown if len(shown) <= length else f"{shown[: length - 1]}…"
 
 
-def plain(value: Any) -> Any:
-    """Return a value that JSON can represent: non-finite numbers as None, arrays as lists."""
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, str | bool | int | None):
-        return value
-    return str(value)
-
-
 def as_json(content: Mapping[str, Any], status: int = 200) -> Response:
     """Return a JSON response."""
-    text = json.dumps(plain(content), allow_nan=False, separators=(",", ":"))
+    text = json.dumps(jsonable(content), allow_nan=False, separators=(",", ":"))
     return Response(text, status, media_type="application/json")
 
 

@@ -27,9 +27,9 @@ from analysis.data.selection import Entry, Selection
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
 from dopt.assessment import TURN, Plane, turns, wrap
 from dopt.spec.trial import is_prequential, system_of
+from dopt.types import Array, Integers
 from orchestrate.store import Reader
 
-Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.integer[Any]]
 
 CONFIDENCE = 0.95
@@ -143,7 +143,7 @@ def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, fl
     if np.ptp(values) <= _ROUNDING * np.abs(values).max():
         return float(values[0]), float(values[0])
     if not FEWEST_BOOTSTRAP_VALUES <= len(values) <= MOST_BOOTSTRAP_VALUES:
-        half = student_quantile(len(values) - 1) * float(standard_error(values))
+        half = float(student_quantile(len(values) - 1) * standard_error(values))
         return float(np.mean(values)) - half, float(np.mean(values)) + half
     from scipy import stats
 
@@ -153,11 +153,11 @@ def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, fl
     return float(found.low), float(found.high)
 
 
-def student_quantile(freedom: int) -> float:
+def student_quantile(freedom: float | Array) -> Array:
     """Return how many standard errors Student's two-sided interval reaches to each side."""
     from scipy.special import stdtrit  # what scipy.stats calls, whose import takes longer
 
-    return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
+    return np.asarray(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
 
 
 def _bootstrap(values: Array, statistic: Statistic) -> tuple[Array, Array]:
@@ -234,13 +234,22 @@ _CENTRES: dict[Statistic, Any] = {
 def stratified_mean(strata: Sequence[Array]) -> Band:
     """Return the mean over S systems of the means over their runs (n_s, k), each n_s at least 1.
 
-    The interval of 95 % is a percentile bootstrap, pointwise in k; NaN where a system has one run.
-    The draws have their own random stream: equal numbers of runs give equal draws.
+    The interval of 95 % is a percentile bootstrap, pointwise in k, whose draws have their own
+    random stream: equal numbers of runs give equal draws. Where a system has fewer than 30 runs it
+    is Student's, with the degrees of freedom of Welch and Satterthwaite: of 4 systems with 5 runs
+    the bootstrap covered 88 % of normal means. NaN where a system has one run.
     """
     middle = np.mean([np.mean(values, axis=0) for values in strata], axis=0)
-    n = sum(map(len, strata))
-    if min(map(len, strata)) < 2:
+    sizes = np.array([*map(len, strata)])
+    n = int(sizes.sum())
+    if sizes.min() < 2:
         return _without_interval(middle, n)
+    if sizes.min() < FEWEST_BOOTSTRAP_VALUES:
+        parts = np.array([standard_error(values) / len(strata) for values in strata]) ** 2
+        variance, tiny = parts.sum(axis=0), np.finfo(float).tiny
+        freedom = variance**2 / np.maximum((parts.T**2 / (sizes - 1)).T.sum(axis=0), tiny)
+        half = student_quantile(np.maximum(freedom, 1.0)) * np.sqrt(variance)
+        return Band(middle, middle - half, middle + half, n)
     drawn = np.zeros((MEAN_RESAMPLES, *middle.shape))
     for place, values in enumerate(strata):
         drawn += _weights(len(values), place) @ values / len(strata)
@@ -356,7 +365,7 @@ def band_limits(bands: Sequence[Band]) -> Limits:
     return log_limits(np.concatenate([means, edges[edges > low / 3]]))
 
 
-def log_limits(values: npt.NDArray[np.float64], margin: float = 1.15) -> tuple[float, float]:
+def log_limits(values: Array, margin: float = 1.15) -> tuple[float, float]:
     """Return limits around the positive, finite ones of some values; (0.1, 1) for none."""
     usable = values[np.isfinite(values) & (values > 0)]
     if not len(usable):
@@ -375,8 +384,8 @@ class LossCurve:
     policy: str
     label: str
     style: LineStyle
-    t: npt.NDArray[np.int64]
-    x: npt.NDArray[np.float64]
+    t: Integers
+    x: Array
     unit: str
     band: Band
     statistic: Statistic

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-import numpy.typing as npt
 
 from analysis.data.samples import read_sample
 from analysis.data.selection import Entry
 from analysis.stats.curves import CONFIDENCE, band, interval_of_mean
 from analysis.style import of_finished
+from dopt.types import Array, Booleans
 from orchestrate.store import Assessments, Reader
-
-Array = npt.NDArray[np.float64]
 
 
 class Measure(StrEnum):
@@ -274,7 +272,7 @@ def sign_test(wins: int, losses: int) -> float:
     return float(stats.binomtest(wins, wins + losses).pvalue)
 
 
-def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def on_front(costs: Array) -> Booleans:
     """Return which of n choices are on the Pareto front of their costs (n, k), lower is better.
 
     A choice is dominated by another that costs at most as much in every respect and less in one.
@@ -282,7 +280,7 @@ def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """
     one, other = costs[:, None, :], costs[None, :, :]
     dominated = np.any(np.all(other <= one, axis=2) & np.any(other < one, axis=2), axis=1)
-    found: npt.NDArray[np.bool_] = ~dominated & ~np.isnan(costs).any(axis=1)
+    found: Booleans = ~dominated & ~np.isnan(costs).any(axis=1)
     return found
 
 
@@ -379,7 +377,7 @@ def success_rate(successes: Array) -> Interval:
     return float(np.mean(known)), float(interval.low), float(interval.high)
 
 
-def usable(values: Array) -> npt.NDArray[np.bool_]:
+def usable(values: Array) -> Booleans:
     """Return which costs or ratios have a logarithm."""
     return np.isfinite(values) & (values > 0)
 

@@ -15,7 +15,6 @@ from dataclasses import asdict
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import AnalysisError, nearness
@@ -33,9 +32,9 @@ from analysis.stats.scores import (
     mean_losses,
     steps_to,
 )
+from dopt.types import Array
 from orchestrate.store import Reader
 
-Array = npt.NDArray[np.float64]
 BySeed = Mapping[int, float]
 Score = Callable[[Reader, Entry, str], Scores]
 
@@ -217,11 +216,11 @@ def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFra
 
 def nothing_to_compare(selection: Selection) -> AnalysisError:
     """Return the error for a selection without a pair of simulated trials."""
-    selected = f"only {', '.join(selection.labels)}" if selection.labels else "no simulated trial"
+    selected = ", ".join(selection.labels) or "no simulated trial"
     return AnalysisError(
-        f"A comparison needs trials of the reference {selection.reference} and of another "
-        f"variant in one environment, but {selected} is selected: run the others, ask wider, "
-        f"or choose another --reference."
+        f"A comparison needs trials of the reference {selection.reference} and of another variant "
+        f"that are done, of one environment and seed, but the selection ({selected}) has none: run "
+        f"them, ask wider, or choose another --reference."
     )
 
 

@@ -179,7 +179,7 @@ def summary_table(table: pd.DataFrame) -> TextTable:
     )
     note = (
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
-        "Diverged trials: exclude."
+        "Diverged trials are left out."
     )
     if "sample_loss" in table:
         note += " Sample loss: mean over the trials of which one is stored (analysis sample-loss)."
@@ -194,7 +194,7 @@ def comparison_table(table: pd.DataFrame, measure: Measure = Measure.FINAL) -> T
         f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
         "pairs. P(improvement): share of seeds with the lower loss, ties half. "
         f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
-        "Diverged trials: exclude."
+        "Diverged trials are left out."
     )
     return rendered(table, columns, note)
 
@@ -211,7 +211,8 @@ def aggregate_table(table: pd.DataFrame) -> TextTable:
     note = (
         f"Ratio: {_RATIO}; geometric mean over systems, each counted alike, of the geometric mean "
         "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
-        "stratified by system. Compare only rows of the same systems. Diverged trials: exclude."
+        "stratified by system, Student's below 30 pairs of a system. Compare only rows of the "
+        "same systems. Diverged trials are left out."
     )
     return rendered(table, columns, note)
 
@@ -232,7 +233,7 @@ def hitting_times_table(table: pd.DataFrame) -> TextTable:
         "final loss of random inputs unless --epsilon says otherwise. A trial that never gets "
         "there is censored at the horizon: later than any that does, a tie with another such. "
         "P(earlier): share of seeds on which the variant is earlier, "
-        f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: exclude."
+        f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials are left out."
     )
     return rendered(table, columns, note)
 

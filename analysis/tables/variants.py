@@ -14,16 +14,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import (
     AnalysisError,
     Filter,
+    accepted,
     difference,
     latest_sources,
     nearness,
-    newest,
 )
 from analysis.data.samples import coverages, read_curves, sample_losses
 from analysis.data.selection import (
@@ -86,7 +85,6 @@ SIGNIFICANCE = 0.05
 TRUTH = "true model"
 SUCCESS, FREE_RUN = "control_success", "free_run_error"
 ESTIMATES = ("success", "success_low", "success_high", "cost", "cost_low", "cost_high")
-Array = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
 ByMeasure = Mapping[str, BySeed]
 
@@ -136,13 +134,9 @@ def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
     Raises
     ------
     AnalysisError
-        If no environment has both.
+        If no environment has both, or a name that was asked for is not stored.
     """
-    current = [
-        config
-        for config in newest(list(reader.configs()))
-        if wanted.accepts(config) and not is_prequential(config.config)
-    ]
+    current = [config for config in accepted(reader, wanted) if not is_prequential(config.config)]
     configs = latest_sources(reader, current)
     entries = [Entry(config, tuple(reader.trials(config.config_key))) for config in configs]
     names = sorted({config.env for config in configs}, key=environment_rank)

@@ -2,15 +2,15 @@
 # One share of a grid, for machines with a shared folder and no database server (docs/many_machines.md):
 #     bash docs/example/share.sh FOLDER NUMBER SHARES [WORDS OF THE LAUNCH]
 # runs the seeds NUMBER - 1, NUMBER - 1 + SHARES, ... below SEEDS into a file on a disk of this machine.
-folder=$1 number=$2 shares=$3
+folder=${1:?FOLDER NUMBER SHARES are expected} number=${2:?} shares=${3:?}
 shift 3
 disk=$(mktemp -d "${TMPDIR:-/var/tmp}/dopt.XXXXXX") copy=$folder/$number-of-$shares.db
 export DOPT_DB=sqlite:///$disk/share.db
 
 save() { # the copy gets its name when it is complete
+    rm -f "$disk/copy.db" "$copy.partial"
     python -m orchestrate backup "$disk/copy.db" >/dev/null && cp "$disk/copy.db" "$copy.partial" &&
         mv "$copy.partial" "$copy"
-    rm -f "$disk/copy.db"
 }
 
 mkdir -p "$folder"
@@ -27,5 +27,10 @@ for ((second = 1; ; second++)); do
 done
 wait "$launch"
 code=$?
-save && rm -r "$disk"
+if [[ ! -f $disk/share.db ]] || save; then
+    rm -r "$disk"
+else
+    echo "error: $copy cannot be written: the results are in $disk/share.db" >&2
+    code=75
+fi
 exit "$code"

@@ -7,16 +7,12 @@ A new command is a :class:`Command` in a module here and a line in
 from __future__ import annotations
 
 import argparse
-import base64
 import json
-import math
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from typing import Any
 
-import numpy as np
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
@@ -26,6 +22,7 @@ from dopt.errors import unknown_name
 from orchestrate.errors import ExitCode
 from orchestrate.program import Parser, UsageError, as_started, tell, visible
 from orchestrate.store import DEFAULT_URL, URL_VARIABLE, ConfigRow, Reader, default_url
+from orchestrate.store.records import jsonable
 
 PROGRAM = as_started("python -m orchestrate")
 
@@ -86,23 +83,6 @@ def answer(arguments: argparse.Namespace, document: Any, text: str) -> ExitCode:
 def say_json(document: Any) -> None:
     """Print one JSON document; numbers that are not finite are null, bytes are base64."""
     say(json.dumps(jsonable(document), indent=2, allow_nan=False))
-
-
-def jsonable(value: Any) -> Any:
-    """Return the value in the types of JSON."""
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(one) for key, one in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return jsonable(value.tolist())
-    if isinstance(value, list | tuple):
-        return [jsonable(one) for one in value]
-    if isinstance(value, Decimal):
-        return int(value) if value == value.to_integral_value() else jsonable(float(value))
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, bytes | memoryview):
-        return base64.b64encode(value).decode()
-    return value if isinstance(value, bool | int | str | None) else str(value)
 
 
 _UNLIMITED_WIDTH = 100_000  # characters: no line is folded or cut

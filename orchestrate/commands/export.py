@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt import __version__
 from dopt.errors import DoptError
+from dopt.types import Array
 from orchestrate.commands import Command, add_filters, answer, chosen
-from orchestrate.commands.results import counts, public
+from orchestrate.commands.results import counts
 from orchestrate.errors import ExitCode
 from orchestrate.files import whole
 from orchestrate.program import UsageError, check_removed, path
-from orchestrate.store import ConfigRow, Reader, Trajectory
+from orchestrate.store import ConfigRow, Reader, Trajectory, public
 from orchestrate.store.records import now, unpacked_trajectory
-from orchestrate.store.schema import OUTCOME_COLUMNS, trial
+from orchestrate.store.schema import OUTCOME_COLUMNS, STEP_VALUES, trial
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,7 +37,6 @@ _WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id I
 
 
 _TEXT, _WHOLE, _REAL = "string", "int64", "double"
-_STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 _SECTIONS = dict.fromkeys(("env", "policy", "model", "learner"), _TEXT)
 _SIZES = {"width": _WHOLE, "depth": _WHOLE}
 _OUTCOME = {
@@ -51,7 +50,7 @@ _OF_CONFIG = {"config": _TEXT, **_SECTIONS, **_SIZES}
 Columns = Mapping[str, str]
 """Kind of each column of a table."""
 
-CURVES: Columns = {**_OF_CONFIG, **_STEP, **dict.fromkeys(_STEP_COLUMNS, _REAL)}
+CURVES: Columns = {**_OF_CONFIG, **_STEP, **dict.fromkeys(STEP_VALUES, _REAL)}
 """One row for each step."""
 
 TRIALS: Columns = {
@@ -71,7 +70,7 @@ ROWS = 50_000
 KEY_DIGITS = 12
 
 _CURVES = f"""
-SELECT r.seed, r.status, s.t, {", ".join(f"s.{name}" for name in _STEP_COLUMNS)}
+SELECT r.seed, r.status, s.t, {", ".join(f"s.{name}" for name in STEP_VALUES)}
 FROM config c
 JOIN trial r ON r.config_id = c.config_id
 JOIN step s ON s.trial_id = r.trial_id
@@ -211,7 +210,7 @@ def _of_config(
         yield from ((seed, status, unpacked_trajectory(*row)) for seed, status, *row in rows)
 
 
-def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
+def _named(name: str, array: Array, n: int) -> dict[str, Any]:
     """Return the columns of an array under their names, with NaN up to n rows."""
     padded = np.full((n, array.shape[1]), np.nan)
     padded[: len(array)] = array

@@ -14,6 +14,7 @@ from orchestrate.commands.results import ListedTrial, listed, the_one
 from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, length_of_time, path
 from orchestrate.store import RETRIED, Reader, Store
+from orchestrate.store.backend import file_url
 from orchestrate.store.maintenance import (
     Finding,
     Prunable,
@@ -54,7 +55,7 @@ def _merge(url: str, other: str) -> Merged:
     place = given_path(other, "OTHER", UsageError)
     if place.is_dir():
         return merge_folder(url, place)
-    return merge(url, f"sqlite:///{place.absolute()}")
+    return merge(url, file_url(place))
 
 
 def _merge_lines(merged: Merged) -> list[str]:

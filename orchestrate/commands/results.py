@@ -19,19 +19,16 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dopt.limits import VIOLATIONS, WORST
-from dopt.spec.config import completed
 from orchestrate.commands import (
     Command,
     add_filters,
     chosen,
-    jsonable,
     plain,
     say_json,
     show,
     table,
 )
-from orchestrate.errors import ExitCode, without_password
+from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, integer, positive, tell
 from orchestrate.store import (
     ConfigRow,
@@ -39,11 +36,13 @@ from orchestrate.store import (
     FailureKind,
     LaunchRow,
     Reader,
+    TrialReport,
     explorations,
     failure_kinds,
+    trial_report,
 )
 from orchestrate.store import Table as Rows
-from orchestrate.store.records import stored_json, utc_text
+from orchestrate.store.records import jsonable, utc_text
 
 RATE_WINDOW_SECONDS = 300.0
 """Period over which the rate is averaged."""
@@ -148,79 +147,6 @@ def seconds_since(moment: str, now: datetime) -> float:
     return (now - datetime.fromisoformat(moment)).total_seconds()
 
 
-_TRIAL = "SELECT * FROM v_trial WHERE trial_id = :trial_id"
-_CONFIG = "SELECT config_json FROM config WHERE config_key = :config_key"
-_ATTEMPTS = """
-SELECT a.attempt, a.launch_id, a.outcome, a.cause, a.node, a.pid, a.claimed, a.started, a.ended,
-       a.wall_seconds, a.cpu_seconds, a.peak_memory_bytes, e.type, e.message, e.traceback
-FROM attempt a
-LEFT JOIN error e ON e.error_id = a.error_id
-WHERE a.trial_id = :trial_id
-ORDER BY a.attempt
-"""
-_LOSS = "SELECT loss FROM step WHERE trial_id = :trial_id ORDER BY t"
-_BEYOND = f"""
-SELECT measure, value FROM assessment
-WHERE trial_id = :trial_id AND measure IN ('{VIOLATIONS}', '{WORST}') ORDER BY t, measure
-"""
-
-
-@dataclass(frozen=True)
-class TrialReport:
-    """Contents of the database about one trial.
-
-    Attributes
-    ----------
-    trial
-        Row of ``v_trial``.
-    config
-        The whole configuration without the seed.
-    launches
-        The launches that ran it, without passwords.
-    attempts
-        One for each claim, with its error if there was one.
-    loss
-        The loss curve, with None for values that are not finite; empty without one.
-    beyond_limits
-        ``violations`` and ``worst`` of a trial with limits (:data:`dopt.assessment.MEASURES`).
-    exploration
-        Steps of an exploration, and whether it goes on; None for another trial.
-    """
-
-    trial: Mapping[str, Any]
-    config: Mapping[str, Any]
-    launches: Sequence[Mapping[str, Any]]
-    attempts: Sequence[Mapping[str, Any]]
-    loss: Sequence[float | None]
-    beyond_limits: Mapping[str, float | None]
-    exploration: ExplorationRow | None = None
-
-
-def report(reader: Reader, trial_id: int) -> TrialReport:
-    """Return the report of a trial; ``reader`` is a snapshot."""
-    trial = reader.rows(_TRIAL, trial_id=trial_id)[0]._asdict()
-    attempts = [row._asdict() for row in reader.rows(_ATTEMPTS, trial_id=trial_id)]
-    tried = {attempt["launch_id"] for attempt in attempts}
-    ((text,),) = reader.rows(_CONFIG, config_key=trial["config_key"])
-    return TrialReport(
-        trial=trial,
-        config=completed(stored_json(text, dict)),
-        launches=[public(one) for one in reader.launches() if one.launch_id in tried],
-        attempts=attempts,
-        loss=[row[0] for row in reader.rows(_LOSS, trial_id=trial_id)],
-        beyond_limits={row[0]: row[1] for row in reader.rows(_BEYOND, trial_id=trial_id)},
-        exploration=next(
-            (one for one in explorations(reader) if one.trial_key == trial["trial_key"]), None
-        ),
-    )
-
-
-def public(launch: LaunchRow) -> dict[str, Any]:
-    """Return a launch without passwords."""
-    row = asdict(launch)
-    return row | {name: [*map(without_password, row[name])] for name in ("argv", "overrides")}
-
-
 DEFAULT_LIMIT = 1_000
 DEFAULT_TIMEOUT_SECONDS = 60.0
 _MAX_TEXT = 60  # characters of a value in a table
@@ -311,7 +237,7 @@ def _run_show(arguments: argparse.Namespace) -> ExitCode:
     with Reader.open(arguments.db) as reader, reader.moment() as moment:
         rows = listed(moment, arguments, width=arguments.width, seed=arguments.seed)
         row = the_one(rows, arguments.trial)
-        found = report(moment, row.trial_id)
+        found = trial_report(moment, row.trial_id)
     if arguments.json:
         say_json(asdict(found))
     else:

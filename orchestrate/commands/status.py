@@ -121,7 +121,7 @@ def _failure(kind: FailureKind) -> Text:
     text.append(f": {', '.join([*places[:_MAX_PLACES], *more])}")
     last = kind.last_line or f"{kind.type or ''}: {kind.message or ''}".strip(": ")
     lines = [kind.message] if kind.message and kind.message not in last else []
-    for line in [*lines, last, *([f"at {kind.place}"] if kind.place else [])]:
+    for line in filter(None, [*lines, last, kind.place and f"at {kind.place}"]):
         text.append("\n      ").append(plain(_first_line(line)))
     return text
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain, zip_longest
-from typing import Any, Literal, cast
+from typing import Any
 
 from dopt.errors import IncompatibleError, SpecificationError, stripped, unknown_name
 from dopt.registry import name_of
@@ -166,12 +167,12 @@ def count(key: str, value: object) -> int | None:
     raise wrong(key, value, "null or a whole number above 0")
 
 
-def limit(key: str, value: object, unit: str) -> float | None:
+def limit(key: str, value: object, unit: str = "seconds") -> float | None:
     """Return a positive number, or None for no limit."""
     return None if value is None else amount(key, value, unit, "null or a number")
 
 
-def amount(key: str, value: object, unit: str, kind: str = "a number") -> float:
+def amount(key: str, value: object, unit: str = "seconds", kind: str = "a number") -> float:
     """Return a positive number below :data:`LARGEST`."""
     if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < LARGEST:
         return float(value)
@@ -214,7 +215,22 @@ def precision(key: str, value: object) -> float | None:
 
 RETRY = ("failed", "diverged", "all")
 
-Retry = Literal["failed", "diverged", "all"]
+
+def retried(key: str, value: object) -> str | None:
+    """Return the status of trials that run again, or None."""
+    if value is None or value in RETRY:
+        return value
+    raise unknown_name(key, value, RETRY)
+
+
+_SECTIONS = ("launch", "store", "executor")
+_CHECKS: Mapping[str, Callable[[str, object], Any]] = {
+    **dict.fromkeys(("dry_run", "detach", "fail_fast"), flag),
+    **dict.fromkeys(("chunk_seconds", "lease", "patience"), amount),
+    **{"retry": retried, "until": precision, "workers": count, "timeout": limit},
+    "memory_gib": partial(limit, unit="GiB"),
+}
+"""Checks of the settings of a launch that stand alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,7 +275,7 @@ class LaunchSettings:
     dry_run: bool = False
     detach: bool = False
     fail_fast: bool = False
-    retry: Retry | None = None
+    retry: str | None = None
     until: float | None = None
     workers: int | None = None
     chunk_seconds: float = 1.0
@@ -280,39 +296,20 @@ class LaunchSettings:
         LaunchError
             If a value has the wrong type or is out of bounds.
         """
-        launch = section("launch", given["launch"])
-        store, executor = section("store", given["store"]), section("executor", given["executor"])
-        memory_gib = limit("launch.memory_gib", launch["memory_gib"], "GiB")
-        retry = launch["retry"]
-        if retry is not None and retry not in RETRY:
-            raise unknown_name("launch.retry", retry, RETRY)
+        launch, store, executor = (section(name, given[name]) for name in _SECTIONS)
+        checked = {name: check(f"launch.{name}", launch[name]) for name, check in _CHECKS.items()}
+        if checked["patience"] >= checked["lease"]:  # a launch gives up before its lease ends
+            raise wrong(
+                "launch.patience", launch["patience"], f"less than launch.lease={launch['lease']}"
+            )
         return cls(
+            **checked,
             executor=text("executor.name", executor["name"]),
             store_url=stripped(text("store.url", store["url"]), "store.url", LaunchError),
-            dry_run=flag("launch.dry_run", launch["dry_run"]),
-            detach=flag("launch.detach", launch["detach"]),
-            fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
-            retry=cast("Retry | None", retry),
-            until=precision("launch.until", launch["until"]),
-            workers=count("launch.workers", launch["workers"]),
-            chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
-            timeout=limit("launch.timeout", launch["timeout"], "seconds"),
-            memory_gib=memory_gib,
             retry_memory=factor(
-                "launch.retry_memory", launch["retry_memory"], "launch.memory_gib", memory_gib
+                *("launch.retry_memory", launch["retry_memory"]),
+                *("launch.memory_gib", launch["memory_gib"]),
             ),
-            **_lease_and_patience(launch["lease"], launch["patience"]),
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},
         )
-
-
-def _lease_and_patience(lease: object, patience: object) -> dict[str, Any]:
-    """Check that a launch gives up waiting for its database before its lease ends."""
-    seconds = {
-        "lease": amount("launch.lease", lease, "seconds"),
-        "patience": amount("launch.patience", patience, "seconds"),
-    }
-    if seconds["patience"] >= seconds["lease"]:
-        raise wrong("launch.patience", patience, f"less than launch.lease={lease}")
-    return seconds

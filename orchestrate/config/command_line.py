@@ -19,6 +19,7 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -55,10 +56,11 @@ _OPTIONS = (
 )
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
-_UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
-"""Path with a character that Hydra takes in quotes alone."""
+_UNQUOTED = re.compile(r"(?s)(?!null$)[^'\"](?:(?!,\w+://).)*")
+"""Database URL that may hold a character which Hydra takes in quotes alone; not several."""
 
-_CHOICE = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>null|\[.*\]|)\s*")
+_CHOICE = re.compile(r"(?P<added>\+{0,2})(?P<group>[\w/]+)(?P<package>@[\w.:]*)?=(?P<value>.*)")
+_NO_OPTION = re.compile(r"(null|\[.*\]|)\s*")
 _OF_TRIALS = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
 """Override of a key that may exist only in some options of a grid."""
 
@@ -173,12 +175,15 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
 
 
 def _check_choice(word: str) -> None:
-    """Refuse null, a list or an empty value as the option of a group, which Hydra cannot handle."""
+    """Refuse null, a list or an empty value as the option of a group, and one more option."""
     match = _CHOICE.fullmatch(word)
-    if not match or match["group"] == "experiment":
+    options = ", ".join(option_names(match["group"])) if match else ""
+    if not match or not options:
         return
     group, value = match["group"], match["value"]
-    if options := ", ".join(option_names(group)):
+    if match["added"] and not match["package"] and not value.startswith("{"):
+        raise UsageError(f"'{word}' adds an option, but {group} has one already: leave out the +.")
+    if group != "experiment" and _NO_OPTION.fullmatch(value):
         what = f"the list {value}" if value.startswith("[") else value or "empty"
         raise SpecificationError(
             f"{group} is {what}, but one of {options} is expected: give one, or several to a grid "
@@ -187,11 +192,11 @@ def _check_choice(word: str) -> None:
 
 
 def _quoted(word: str) -> str:
-    """Return ``launch.until=ci<5%`` or a path with the quotes that Hydra requires around them."""
+    """Return ``launch.until=ci<5%`` or a URL with the quotes that Hydra requires around them."""
     key, _, value = word.partition("=")
     rule = key.lstrip("+") == "launch.until" and value.startswith("ci")
     if rule or (key.lstrip("+") == "store.url" and _UNQUOTED.fullmatch(value)):
-        return f"{key}='{value}'"
+        return f"{key}={QuotedString(value, Quote.single).with_quotes()}"
     return word
 
 

@@ -49,6 +49,8 @@ _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env:[^${}]*\}")
 def reject_unknown(config: DictConfig) -> None:
     """Refuse a top-level key that the launch does not read and no setting refers to.
 
+    Settings of a task or of limits that were not chosen would be ignored: they are refused too.
+
     Raises
     ------
     SpecificationError
@@ -60,6 +62,11 @@ def reject_unknown(config: DictConfig) -> None:
         texts = (_ENVIRONMENT.sub("", text) for _, text in _interpolations(config, own))
         if not any(map(reference.search, texts)):
             raise unknown_name("setting", key, KNOWN)
+    for group in ("task", "limits"):
+        section = OmegaConf.select(config, group)
+        names = set(map(str, section)) if isinstance(section, DictConfig) else set()
+        if names > {"name"} and section.name == "none":
+            raise unknown_setting(f"{group}.{min(names - {'name'})}", ())
 
 
 def expand(

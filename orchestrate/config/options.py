@@ -225,7 +225,8 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
     options = loader.get_group_options(override.key_or_group, results_filter=None)
     if options and not any(isinstance(value, dict) for value in values):
         if None in values:
-            raise unknown_name(override.key_or_group, "null", options)
+            names = _every_option(loader, override.key_or_group)
+            raise unknown_name(override.key_or_group, "null", names)
         return Axis(key, texts, values, "choice")
     scalar = override.type == OverrideType.CHANGE and override.package is None
     return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
@@ -400,6 +401,9 @@ def _named() -> Iterator[tuple[str, str, type]]:
 KNOWN = (*TRIAL_SECTIONS, "width", "launch", "store", "executor")
 """Top-level keys that a launch reads, beside Hydra's own."""
 
+_NOTHING = ("none", "ideal")
+"""Options without settings of groups that may be left out."""
+
 _NOT_SETTABLE = ("hydra", "name", TARGET)
 """Keys that messages do not suggest."""
 
@@ -421,7 +425,11 @@ def format_error(error: Exception) -> str:
     if isinstance(error, OverrideParseException) and _BARE.fullmatch(error.override):
         return f"'{error.override}' is not an override: write key=value, such as env=arm."
     if isinstance(error, OverrideParseException):
-        return _one_line(f"cannot read the override '{error.override}': {error.message}")
+        reason = "" if "Lexer" in str(error.message) else f" ({_one_line(str(error.message))})"
+        return (
+            f"cannot read the override '{error.override}'{reason}: put a value with special "
+            "characters into quotes of its own, as in \"env.name='a=b'\"."
+        )
     if match := _SEVERAL.search(str(error)):
         return f"{match[1]} gives several values to one trial: add -m for a grid, or quote it."
     if str(error).startswith("Config group override must be"):
@@ -494,6 +502,12 @@ def unknown_setting(key: str, names: Iterable[str]) -> SpecificationError:
     """Return the error for a dotted key, with the nearest of the names in its place."""
     holder, _, last = key.rpartition(".")
     settable = [name for name in names if name not in _NOT_SETTABLE]
+    options = [name for name in option_names(holder) if name not in _NOTHING]
+    if not settable and len(options) < len(option_names(holder)):
+        return SpecificationError(
+            f"setting of {holder} '{last}' is unknown without an option that has it: add "
+            f"{' or '.join(f'{holder}={name}' for name in options)}."
+        )
     return unknown_name(f"setting of {holder}" if holder else "setting", last, settable)
 
 

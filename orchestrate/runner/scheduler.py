@@ -281,7 +281,9 @@ class SeedPlan:
                 return
             self._used |= {key: min(n, len(self._seeds[key])) for key in wanting}
             stage = self._stage(first=before == 0)
-            yield f"{len(wanting):,} configurations, up to {n} of {numbers[-1]} seeds: ", stage
+            plural = "s" * (len(wanting) > 1)
+            counts = f"{len(wanting):,} configuration{plural}, up to {n} of {numbers[-1]} seeds: "
+            yield counts, stage
             self._look(n, self._relative, final_losses([one.trial_key for one in stage.trials]))
 
     def report(self) -> str:
@@ -311,7 +313,8 @@ class SeedPlan:
         if math.isnan(half):
             return "mean unknown"
         mean = math.exp(float(np.mean(np.log(losses))))
-        found = f"mean {mean:.3g} ± {100 * math.expm1(half):.2g} %"
+        percent = 100 * math.expm1(half)
+        found = f"mean {mean:.3g} ± {percent:{',.0f' if percent > 99 else '.2g'}} %"
         return f"{found}, known" if config_key in self._known else found
 
     def _stage(self, *, first: bool) -> Grid:

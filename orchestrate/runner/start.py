@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import shlex
 import sys
 import threading
 import time
@@ -127,7 +128,7 @@ def launch_grid(
             free_trials(store, grid, settings)
             state = store.register(grid.trials)
             counts = f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
-            say(f"{counts}; start workers with {WORKER} --db {store.safe_url}")
+            say(f"{counts}; start workers with {WORKER} --db {shlex.quote(store.safe_url)}")
             return ExitCode.DONE
         return _run(store, grid, settings, work, output)
 

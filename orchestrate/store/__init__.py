@@ -25,8 +25,11 @@ from orchestrate.store.reader import (
     ExplorationRow,
     FailureKind,
     Reader,
+    TrialReport,
     explorations,
     failure_kinds,
+    public,
+    trial_report,
 )
 from orchestrate.store.records import (
     Assessments,
@@ -77,8 +80,11 @@ __all__ = [
     "StoreUnavailableError",
     "Table",
     "Trajectory",
+    "TrialReport",
     "TrialRow",
     "default_url",
     "explorations",
     "failure_kinds",
+    "public",
+    "trial_report",
 ]

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 from sqlalchemy import URL, Connection, Engine, Select
 from sqlalchemy.engine import make_url
@@ -43,6 +44,9 @@ _EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432
 _SQLITE_FILE = re.compile(r"[\w./-]+\.(db|sqlite3?)")
 """Path of a file in place of a URL; a text that may hold a password does not match."""
 
+_LETTERS = re.compile(r"(?:%[C-F][0-9A-F](?:%[89AB][0-9A-F])+)+")
+"""Codes of letters beyond ASCII in UTF-8."""
+
 _SECRETS = ("password", "sslpassword", "passfile")
 
 
@@ -62,7 +66,12 @@ def parse_url(url: str) -> URL:
     names = [name for name in variables if os.environ.get(name, "").strip() == url.strip() != ""]
     where = f" in the environment variable {names[0]}" if names else ""
     url = stripped(url, f"The database URL{where}", StoreError)
-    if "://" not in url and Path(url).is_dir():
+    if url != url.encode(errors="ignore").decode():
+        raise StoreError(
+            f"The database URL{where} holds bytes that are no text in UTF-8: rename the file or "
+            "folder, or give another path."
+        )
+    if url and "://" not in url and Path(url).is_dir():
         raise StoreError(
             f"{url} is a folder, a database is expected{where}: merge the databases in it with "
             f"'python -m orchestrate merge {shlex.quote(url)} --db URL', and give that URL."
@@ -84,6 +93,11 @@ def parse_url(url: str) -> URL:
             f"The database URL sqlite://{parsed.host}/...{where} names a host, but SQLite has "
             f"none: write three slashes, sqlite:///{parsed.host}/{parsed.database or 'results.db'}."
         )
+    if parsed.query:
+        raise StoreError(
+            f"The database URL{where} has a ?, behind which SQLite takes no options here: leave "
+            "them out, and write ? in the name of a file as %3F."
+        )
     if parsed.database and parsed.database != _IN_MEMORY:
         file = given_path(parsed.database, f"The path in the database URL{where}", StoreError)
         parsed = parsed.set(database=str(file))
@@ -102,10 +116,16 @@ def _place(url: URL) -> tuple[object, ...]:
     return url.get_backend_name(), url.host, url.port or 5432, url.database
 
 
+def file_url(path: Path) -> str:
+    """Return the URL of a SQLite file, whatever its name."""
+    return URL.create("sqlite", database=str(path.absolute())).render_as_string()
+
+
 def public_url(url: URL) -> str:
-    """Return the URL without passwords."""
+    """Return the URL without passwords, and with letters in place of their codes."""
     public = {key: value for key, value in url.query.items() if key not in _SECRETS}
-    return url.set(query=public).render_as_string(hide_password=True)
+    text = url.set(query=public).render_as_string(hide_password=True)
+    return _LETTERS.sub(lambda code: unquote(code[0]), text)
 
 
 def sqlite_path(url: URL) -> Path:
@@ -205,6 +225,7 @@ _WRONG_PLACE = (
     errno.ENOTDIR,
     errno.EPERM,
 )
+_SYNTAX = "42601"  # also of what is no SELECT, as a cursor is declared for it
 _OUT_OF_TIME = ("SQLITE_INTERRUPT", "57014")
 _NOT_OF_THE_QUERY = (*(name for name in _SQLITE if name != "SQLITE_READONLY"), "08", "53", "57P")
 # Names instead of classes, so that a driver that is not installed is not imported.
@@ -277,7 +298,8 @@ def translated_query(safe_url: str, seconds: float | None = None) -> Iterator[No
                 raise
             refused = code == "SQLITE_AUTH"
             reason = "only a SELECT is allowed" if refused else _first_line(error.orig)
-            raise QueryError(f"The query failed on {safe_url}: {reason}.") from error
+            hint = ": give one SELECT" if code == _SYNTAX else ""
+            raise QueryError(f"The query failed on {safe_url}: {reason}{hint}.") from error
 
 
 def out_of_time(seconds: float | None) -> QueryError:
@@ -380,8 +402,7 @@ class Backend(ABC):
     def back_up(self, connection: Connection, version: int) -> str:
         """Copy the database of the given version to a new file and return its path."""
 
-    @abstractmethod
-    def exclusive(self, connection: Connection) -> None:
+    def exclusive(self, connection: Connection) -> None:  # noqa: B027  one writer is alone
         """Keep other launches from registering or recovering until the transaction ends."""
 
     @abstractmethod
@@ -407,9 +428,8 @@ class Backend(ABC):
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:
         """Mark a new launch as alive, before others can see it."""
 
-    @abstractmethod
-    def renew(self, connection: Connection, launch_id: int) -> None:
-        """Extend the life of the launch."""
+    def renew(self, connection: Connection, launch_id: int) -> None:  # noqa: B027  a lock has none
+        """Extend the lease of the launch."""
 
     @abstractmethod
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
@@ -419,12 +439,10 @@ class Backend(ABC):
         """Return a unique name for a launch of this process."""
         return uuid.uuid4().hex
 
-    @abstractmethod
-    def evict(self) -> None:
+    def evict(self) -> None:  # noqa: B027  the kernel releases the locks of a dead process
         """End the transactions of dead launches, which could keep their locks forever."""
 
-    @abstractmethod
-    def forget(self, token: str) -> None:
+    def forget(self, token: str) -> None:  # noqa: B027  a lease expires by itself
         """Delete the lock of a launch that has ended or died."""
 
     @abstractmethod

@@ -29,6 +29,7 @@ from orchestrate.store.backend import (
     Backend,
     copy_checked,
     dump,
+    file_url,
     parse_url,
     public_url,
     translated,
@@ -89,7 +90,7 @@ def merge_folder(url: str, folder: Path) -> Merged:
             copy = Path(local) / path.name
             with translated_file(str(path)):
                 shutil.copyfile(path, copy)
-            total.include(merge(url, f"sqlite:///{copy}"))
+            total.include(merge(url, file_url(copy)))
     return total
 
 

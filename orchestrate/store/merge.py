@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
+from dopt.types import Array
 from orchestrate.errors import StoreError
 from orchestrate.store import records, sqlite
 from orchestrate.store.backend import Backend, parse_url, public_url, sqlite_path
 from orchestrate.store.reader import Reader
-from orchestrate.store.records import DTYPE, Array, stored_json, unpack
+from orchestrate.store.records import DTYPE, stored_json, unpack
 from orchestrate.store.schema import (
     FINISHED,
     N_ROWS,

@@ -30,6 +30,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
+from dopt.types import Array
 from orchestrate.errors import StoreError, StoreUnavailableError
 from orchestrate.store.backend import (
     ANNOUNCE_SECONDS,
@@ -41,7 +42,7 @@ from orchestrate.store.backend import (
     log,
     public_url,
 )
-from orchestrate.store.records import Array, finite_list
+from orchestrate.store.records import finite_list
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
 
 if TYPE_CHECKING:
@@ -233,9 +234,6 @@ class PostgreSQLBackend(Backend):
         # In a short transaction of its own: it reads a table that an upgrade locks.
         with self.transaction() as connection:
             _end_dead(connection)
-
-    def forget(self, token: str) -> None:
-        """Do nothing: a lease expires by itself."""
 
     def close(self) -> None:
         self.engine.dispose()

@@ -12,6 +12,7 @@ within one.
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import math
@@ -20,11 +21,11 @@ from collections import namedtuple
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from decimal import Decimal
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from sqlalchemy import (
     Case,
     ColumnElement,
@@ -39,11 +40,10 @@ from sqlalchemy import (
     text,
 )
 
+from dopt.types import Array, Booleans, Integers
 from orchestrate.errors import StoreError, StoreUnavailableError
 from orchestrate.store.backend import Backend
 from orchestrate.store.schema import FINISHED, N_ROWS, STEP_VALUES, Outcome, curve, step, trial
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,23 @@ def finite_list(array: Array) -> list[float | None]:
     if np.isfinite(array).all():
         return numbers
     return [finite(number) for number in numbers]
+
+
+def jsonable(value: Any) -> Any:
+    """Return the value in the types of JSON."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(one) for key, one in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return jsonable(value.tolist())
+    if isinstance(value, list | tuple):
+        return [jsonable(one) for one in value]
+    if isinstance(value, Decimal):
+        return int(value) if value == value.to_integral_value() else jsonable(float(value))
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, bytes | memoryview):
+        return base64.b64encode(value).decode()
+    return value if isinstance(value, bool | int | str | None) else str(value)
 
 
 def storable(text: str) -> str:
@@ -255,10 +272,10 @@ class Curves:
     diverged : (n,) bool
     """
 
-    seeds: npt.NDArray[np.int64]
-    t: npt.NDArray[np.int64]
+    seeds: Integers
+    t: Integers
     values: Array
-    diverged: npt.NDArray[np.bool_]
+    diverged: Booleans
 
 
 class Assessments(Curves):

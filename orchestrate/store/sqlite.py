@@ -38,6 +38,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.pool import QueuePool
 
+from dopt.types import Array
 from orchestrate.errors import (
     DatabaseMovedError,
     NoDatabaseError,
@@ -57,7 +58,6 @@ from orchestrate.store.backend import (
     sqlite_path,
     translated_file,
 )
-from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, VIEWS, trial
 
 MOUNT_TABLE = Path("/proc/self/mountinfo")
@@ -496,9 +496,6 @@ class SQLiteBackend(Backend):
         write = partial(copy_checked, self._path)
         return back_up_to(f"{self._path}.v{version}-backup", "", write)
 
-    def exclusive(self, connection: Connection) -> None:
-        """Do nothing: BEGIN IMMEDIATE lets one transaction in at a time."""
-
     def members(self, keys: Sequence[str]) -> Select[Any]:
         return select(func.json_each(json.dumps(list(keys))).table_valued("value").c.value)
 
@@ -521,14 +518,8 @@ class SQLiteBackend(Backend):
         with translated_file(self.safe_url):
             self._locks.acquire(token)
 
-    def renew(self, connection: Connection, launch_id: int) -> None:
-        """Do nothing: the file lock is held until the process ends."""
-
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
-
-    def evict(self) -> None:
-        """Do nothing: the kernel releases the locks of a dead process."""
 
     def forget(self, token: str) -> None:
         self._locks.release(token)

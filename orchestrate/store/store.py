@@ -23,6 +23,7 @@ from sqlalchemy import (
     update,
 )
 
+from dopt.types import Array
 from orchestrate.errors import InvalidResultError, StoreError, without_password
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store import records, schema
@@ -38,7 +39,6 @@ from orchestrate.store.launches import (
 from orchestrate.store.postgresql import PostgreSQLBackend
 from orchestrate.store.records import (
     DTYPE,
-    Array,
     Claim,
     finite,
     not_before,

@@ -15,7 +15,7 @@ import pytest
 
 import analysis
 from analysis.data.matching import AnalysisError, Filter, defaults, nearness, newest
-from analysis.data.samples import STEP_COLUMNS, learned_model, simulated_trial
+from analysis.data.samples import learned_model, simulated_trial
 from analysis.data.selection import is_possible, select
 from analysis.figures.phase_portraits import (
     measure_portraits,
@@ -29,6 +29,7 @@ from dopt.errors import SpecificationError
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Curves, NoDatabaseError, Reader
+from orchestrate.store.schema import STEP_VALUES
 from tests.analysis.conftest import SHORT, controlled
 from tests.analysis.synthetic import fake_result, fill, filled, make_grid, make_spec
 
@@ -41,12 +42,12 @@ def results(url: str) -> Iterator[analysis.Results]:
 
 def test_curves_are_tidy_and_exact(results: analysis.Results) -> None:
     table = results.curves()
-    assert table.columns[-len(STEP_COLUMNS) :].tolist() == list(STEP_COLUMNS)
+    assert table.columns[-len(STEP_VALUES) :].tolist() == list(STEP_VALUES)
     chosen = table[
         (table.env == "cartpole") & (table.policy == "uniform") & (table.seed == 3)
     ].reset_index()
     expected = fake_result(make_spec("cartpole", "uniform", 3, env={"horizon": 60}))
-    for name in STEP_COLUMNS:
+    for name in STEP_VALUES:
         np.testing.assert_array_equal(chosen[name], getattr(expected, name))
     np.testing.assert_allclose(chosen.time, chosen.dt * chosen.t)
 

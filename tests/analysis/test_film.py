@@ -135,12 +135,28 @@ def test_a_trial_that_runs_another_way_is_refused(
         story()
 
 
+def test_where_two_configurations_fit_one_can_be_chosen(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sizes = ({"width": 8}, {"width": 12})
+    specs = [make_spec("pendulum", "random", 1, env={"horizon": 9}, model=one) for one in sizes]
+    words = ["animate", "pendulum", "random", "--frames", "2", "--db", stored(tmp_path, specs)]
+    assert main(words) == 2
+    advice = capsys.readouterr().err.partition("choose one with ")[2].rstrip(".\n")
+    assert main([*words, *advice.split()]) == 0
+    assert main([*words, "--where", "model.width=9"]) == 2
+    assert "stored are 8, 12: choose one" in capsys.readouterr().err
+
+
 def test_the_command_picks_a_seed_and_a_name(
     url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["animate", "quadrotor", "d_optimal", "--db", url, "--frames", "3"]) == 0
     assert capsys.readouterr().out == "figures/quadrotor_d_optimal.gif: seed 1, 3 pictures\n"
+    assert main(["animate", "pendulum", "oracle", "--db", url, "--frames", "1"]) == 0
+    assert capsys.readouterr().out == "figures/pendulum_oracle.gif: seed 1, 1 pictures\n"
     assert main(["animate", "pendulum", "d_optimal", "--db", url, "--seed", "9"]) == 2
     assert "by --seed one of [1]" in capsys.readouterr().err
     assert main(["animate", "pendulum", "uniform", "--db", url]) == 2

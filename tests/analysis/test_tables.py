@@ -173,7 +173,7 @@ def test_markdown_shows_counts_and_dashes() -> None:
     counts = {"env": "arm", "policy": "random", "label": "random", "n": 98, "n_diverged": 2}
     summary = summary_table(pd.DataFrame([counts | values])).markdown()
     assert "1.00 ± 0.10" in summary
-    assert "Diverged trials: exclude." in summary
+    assert "Diverged trials are left out." in summary
 
 
 def test_every_caption_says_what_is_divided_by_what() -> None:

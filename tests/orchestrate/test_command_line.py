@@ -71,7 +71,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["seed=range(3)"], "'seed=range\\(3\\)' gives several values to one trial"),
         (["launch.ray=3"], "launch.ray is 3, but a section"),
         (["width=${wdth}"], "'wdth' not found"),
-        (["env=[1"], "cannot read the override 'env=\\[1'"),
+        (["env=[1"], "cannot read the override 'env=\\[1' .*: put a value with special characters"),
         (["env=quadrotor", "policy=periodic"], "eigenmode"),
         (["-m", "env=quadrotor", "policy=periodic"], "the grid is empty: env=quadrotor"),
         (["executor.name=locla"], "executor.name 'locla' is unknown.* did you mean 'local'"),
@@ -82,7 +82,11 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         ),
         (["plant=real", "plant.delay=-1"], "plant.delay is -1.0 samples"),
         (["plant=real", "plant.counts=0"], "plant.counts is 0.0"),
-        (["plant.delay=1"], "setting of plant 'delay' is unknown"),
+        (["plant.delay=1"], "setting of plant 'delay' is unknown without .*: add plant=real"),
+        (["+limits.bounds={y:[-1,1]}"], "'bounds' is unknown without .*: add limits=box or lim"),
+        (["-m", "seed=0", "++task.steps=3"], "'steps' is unknown without .*: add task=control"),
+        (["+env=arm"], "'\\+env=arm' adds an option, but env has one already: leave out the \\+"),
+        (["-m", "++policy=random"], "adds an option, but policy has one already"),
         (["plant=reel"], "plant 'reel' is unknown: did you mean 'real'"),
         (["plant=real", "plant.delay=1", "model=affine"], "goes with a model of the state alone"),
         (["executor=rey"], "executor 'rey' is unknown.* did you mean 'ray'"),
@@ -98,6 +102,8 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["store.url=sqlite:///~nobody-here/r.db"], "is '~nobody-here/r.db', but a path is expec"),
         (["store.url=sqlite:///a\nb.db"], "holds the control character '\\\\n'"),
         (["store.url=postgresql://you:secret@host/a\tb"], "holds the control character '\\\\t'"),
+        (["store.url=sqlite:///r.db?mode=ro"], "has a \\?, behind which SQLite takes no options"),
+        (["store.url=sqlite:///r\udcff.db"], "bytes that are no text in UTF-8"),
         (["store.url=sqlite:////dev"], "/dev is a folder, but a file is expected"),
         (["--cfg", "jobs"], "--cfg 'jobs' is unknown.* did you mean 'job'"),
         (["--bogus"], "option '--bogus' is unknown"),
@@ -114,6 +120,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "\\+env\\.mass="),
         (["env=[arm,cartpole]"], "env is the list \\[arm,cartpole\\], .*-m env=a,b"),
         (["-m", "env=null,arm"], "env 'null' is unknown"),
+        (["-m", "~policy"], "policy 'null' is unknown: choose one of baseline/chirp, "),
         (["pendulum"], "'pendulum' is not an override: write key=value"),
         (["seed=abc"], "seed is 'abc', but a whole number"),
         (["seed=1.5"], "seed is 1.5, but a whole number"),
@@ -488,6 +495,8 @@ def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
     _, _, errors = command_line(*SHORT)
     assert f"{FROM_VARIABLE}: write it as sqlite:///results/results.db or " in errors
     assert "secret" not in errors
+    monkeypatch.setenv("DOPT_DB", "  ")
+    assert "error: The database URL cannot be read: write it as" in command_line(*SHORT)[2]
     _, _, errors = command_line(*SHORT, "store.url=mine/x.db")
     assert "The database URL cannot be read: write it as sqlite:///mine/x.db." in errors
 
@@ -597,6 +606,22 @@ def test_a_database_in_the_home_folder(
     monkeypatch.delenv("DOPT_DB")
     assert "already done" in command_line(*TRIAL, f"store.url={given}")[1]
     assert [path.name for path in Path.cwd().iterdir()] == ["home"]
+
+
+@pytest.mark.parametrize(
+    "name", ['it\'s "ü" (b).db', "[x]{y},z=1.db", "b~ a.db", "größe/100%25 %3F.db"]
+)
+def test_a_database_of_any_name(command_line: Command, tmp_path: Path, name: str) -> None:
+    url = f"sqlite:///./{name}"
+    for words in (TRIAL, ("-m", "seed=0", *TRIAL)):
+        code, output, errors = command_line(*words, f"store.url={url}")
+        assert (code, errors) == (0, "")
+    said = output.splitlines()[0].rpartition(" · ")[2]
+    assert "ü" in said if "ü" in name else "%C3" not in said
+    for given in (url, said):
+        assert orchestrate(["status", "--db", given]) == 0
+    assert orchestrate(["merge", "--db", "sqlite:///merged.db", str(parse_url(url).database)]) == 0
+    assert orchestrate(["merge", "--db", "sqlite:///merged.db", str(tmp_path)]) == 0
 
 
 @pytest.mark.usefixtures("home")

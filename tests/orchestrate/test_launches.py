@@ -97,20 +97,11 @@ def share(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
         def start(number: int = 1, **settings: str) -> subprocess.Popen[str]:
             path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
             given = {"TMPDIR": str(tmp_path), "SEEDS": "20", "PATH": path, **settings}
-            words = [
-                "bash",
-                "docs/example/share.sh",
-                f"{tmp_path}/shared",
-                f"{number}",
-                f"{SHARES}",
-            ]
+            words = f"bash docs/example/share.sh {tmp_path}/shared {number} {SHARES}".split()
             started = subprocess.Popen(
-                [*words, *GRID],
-                cwd=ROOT,
-                env={**os.environ, **given},
-                stdout=subprocess.PIPE,
+                [*words, *GRID], cwd=ROOT, env={**os.environ, **given}, stdout=subprocess.PIPE,
                 text=True,
-            )
+            )  # fmt: skip
             return stack.enter_context(started)
 
         yield start
@@ -136,6 +127,17 @@ def test_merged_shares_are_the_rows_of_one_database(
     assert main(["merge", f"{tmp_path}/shared", "--db", merged]) == 0
     assert numbers(merged) == numbers(one)
     assert flaws(merged) == []
+
+
+def test_a_share_that_cannot_be_copied_is_kept(
+    share: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    (tmp_path / "cp").write_text("#!/bin/sh\nexit 1\n")
+    (tmp_path / "cp").chmod(0o755)
+    path = f"{tmp_path}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+    assert share(PATH=path).wait(PATIENCE_SECONDS) == ExitCode.INFRASTRUCTURE
+    (kept,) = tmp_path.glob("dopt.*/share.db")
+    assert len(trials(f"sqlite:///{kept}")) == 7
 
 
 def test_a_share_is_copied_while_it_runs_and_goes_on_elsewhere(

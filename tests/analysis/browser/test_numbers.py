@@ -80,6 +80,7 @@ def test_a_width_and_a_condition_choose_other_configurations(client: TestClient)
         assert [curve["policy"] for curve in curves] == ["d_optimal", "oracle", "random"]
     refused = client.get("/api/curves?env=pendulum&width=5")
     assert refused.status_code == 400
+    assert "the field Where model.width=" in refused.json()["error"]
     assert "fits no stored configuration" in refused.json()["error"]
 
 

@@ -26,8 +26,9 @@ from playwright.sync_api import Browser, expect
 from analysis.cli import main
 from analysis.serve import app, web
 from analysis.serve import app as serving
-from analysis.serve.web import Cache, Database, Events, plain, read_progress
+from analysis.serve.web import Cache, Database, Events, read_progress
 from orchestrate.store import Store
+from orchestrate.store.records import jsonable
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
 from tests.orchestrate.faults.laboratory import alive, children, command_line
@@ -91,7 +92,7 @@ def test_a_kept_value_is_not_computed_again_until_it_is_forgotten() -> None:
 
 
 def test_numbers_that_are_not_finite_are_null() -> None:
-    found = plain({"a": [float("nan"), float("inf"), 1.5], "b": (True, None, Path("x"))})
+    found = jsonable({"a": [float("nan"), float("inf"), 1.5], "b": (True, None, Path("x"))})
     assert found == {"a": [None, None, 1.5], "b": [True, None, "x"]}
 
 

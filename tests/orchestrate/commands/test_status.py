@@ -138,6 +138,15 @@ def test_attempts_that_were_made_good_are_no_failed_trials(
     assert (kind["cause"], kind["trials"], kind["attempts"]) == ("killed", 0, 1)
 
 
+def test_the_death_of_a_worker_has_no_message(
+    store: Store, take: Take, command: Run, launch: int
+) -> None:
+    (claim,) = take(Spec())
+    store.release(launch, [claim.trial_key], "killed")
+    failures = command("status").out.partition("Failures\n")[2].partition("\n\n")[0]
+    assert failures.strip() == "0 trials (1 attempt), killed: pendulum/random"
+
+
 @on_both
 def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader, url: str) -> None:
     for claim in take(*(Spec(seed) for seed in range(4))):
