@@ -129,7 +129,9 @@ class MLP(Model):
         return hidden
 
     def n_parameters(self, system: System) -> int:
-        return sum((n_in + 1) * n_out for n_in, _, n_out in self._layers(system))
+        n_in, n_out, width = self.n_first_inputs(system), system.n_learned, self.width
+        hidden = (n_in + 1) * width + (self.depth - 1) * (width + 1) * width
+        return hidden + (self.n_output_inputs(system) + 1) * n_out
 
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
         """Draw every weight and bias of a layer uniformly in ±1/√(units below it)."""
