@@ -122,21 +122,19 @@ class Limits:
 
 
 def check_weight(body: Body, limits: Limits) -> None:
-    """Refuse limits of torque that weight and dry friction exceed in all of some positions."""
+    """Refuse limits of torque that hold the body at rest in none of many random positions."""
     low, high = limits.position.T
     q = low + (high - low) * np.random.default_rng(0).random((POSES, body.n))
     weights = np.abs(body.torques(Motion(1.0, q, *np.zeros((2, *q.shape)))))
-    weights += body.model.dof_frictionloss[body.dofs]
     shares = weights / limits.torque
     best = int(shares.max(axis=1).argmin())
     k = int(shares[best].argmax())
     if shares[best, k] > 1.0:
         unit = body.units[k]
         raise SpecificationError(
-            f"joint '{body.joints[k]}' takes {weights[best, k]:.4g} {unit} to begin to move, in "
-            f"the best of {POSES} random positions, but its limit of torque is "
-            f"{limits.torque[k]:g} {unit}: give a larger limit, or ranges of position in which it "
-            f"carries less."
+            f"joint '{body.joints[k]}' takes {weights[best, k]:.3g} {unit} at rest, in the best of "
+            f"{POSES} random positions, but its limit of torque is {limits.torque[k]:g} {unit}: "
+            f"give a larger limit, or ranges of position in which it carries less."
         )
 
 
