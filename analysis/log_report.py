@@ -33,6 +33,9 @@ INPUTS = re.compile(
 )
 """Columns that are taken for inputs where none are named."""
 
+LEFT_OUT = "left out"
+"""Attribute of a table: a sentence on the variables of its file that are no columns."""
+
 _COMMANDED = re.compile(r"con|cmd|command|des|ref", re.IGNORECASE)
 _MEASURED = re.compile(r"meas", re.IGNORECASE)
 
@@ -118,7 +121,10 @@ def log_of(
             if one not in taken and not is_clock(one) and not one.startswith("Unnamed: ")
             if not is_flag(table[one]) and not INPUTS.search(one)
         ]
-    return Log(table, states=states, inputs=inputs, **options)
+    log = Log(table, states=states, inputs=inputs, **options)
+    if LEFT_OUT in table.attrs:
+        log.notes = (table.attrs[LEFT_OUT], *log.notes)
+    return log
 
 
 def is_flag(values: pd.Series[Any]) -> bool:
@@ -199,7 +205,11 @@ def _of_variables(file: Path, variables: Mapping[str, Any]) -> pd.DataFrame:
             f"{file} holds {shown or 'no arrays'}, but variables of one length are expected of a "
             f"log: give the ones of one run to dopt.Log."
         )
-    return pd.DataFrame({name: one for name, one in columns.items() if len(one) == rows})
+    table = pd.DataFrame({name: one for name, one in columns.items() if len(one) == rows})
+    others = [f"{name} ({len(one):,})" for name, one in columns.items() if len(one) != rows]
+    if others:
+        table.attrs[LEFT_OUT] = f"Not of {rows:,} values, left out: {', '.join(others)}."
+    return table
 
 
 def _flattened(found: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:

@@ -100,8 +100,13 @@ class Explorer(Explored):
     ``late``
         stretches of 300 steps whose errors follow from inputs of earlier steps: a delay or a lag
         that was not declared; not tested where states are measured with noise
+    ``worse``
+        tests, every 500 steps, in which the learned model predicted the last ones 50 at a time with
+        1.25 times the error of the known part alone, or more
     ``altered``
         learned steps in which another input was applied than :meth:`ask` returned
+    ``supply``
+        fits that found a level beyond which inputs act no more, at which plans are then cut
     ``out_of_scale``
         learned accelerations of another size than a network learns, by the first 50 steps
     ``beyond``
@@ -109,7 +114,7 @@ class Explorer(Explored):
     ``narrow``
         sides of the box of which the first 500 states cover less than a tenth
 
-    Each of the last six is also said once, by a warning.
+    Each of the last eight is also said once, by a warning.
 
     Of a plant some of whose states are measured with noise (``Plant(measured=...)``), :meth:`ask`
     and :meth:`tell` are given these states, (n,), in the order of all, in their place; the learner

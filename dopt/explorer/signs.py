@@ -29,7 +29,7 @@ from dopt.types import Array
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
     "late": "stretches of 300 steps whose errors follow from earlier inputs",
-    "worse": "tests in which free runs of the learned model were worse than of the known part alone",
+    "worse": "tests in which the learned model predicted worse than the known part alone",
     "altered": "learned steps in which another input was applied than was asked",
     "supply": "fits that found a level beyond which inputs act no more",
     "out_of_scale": "learned accelerations of another size than a network learns",
@@ -85,14 +85,13 @@ _TEXTS = {
     "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
     "once, or as declared: declare Plant(delay=..., lag=...), or let learner='simulation_error' "
     "fit them (dopt.unknown)",
-    "worse": "over the last steps, %d at a time, the learned model predicts with %.3g times the error "
-    "of the known part alone, but what is learned is expected to help: estimate the states with the "
-    "learner 'joint_ekf' or 'simulation_error', raise velocity_cutoff or the noise variance, or take "
-    "the model out",
+    "worse": "%d steps ahead the learned model predicts with %.3g times the error of the known "
+    "part alone, but it is expected to help: let 'joint_ekf' or 'simulation_error' learn, which "
+    "estimate states, or raise velocity_cutoff or the noise variance",
     "altered": "another input than ask() returned was applied in %d of %d steps, but plans count "
     "on theirs: declare Plant(supply=...) if inputs are cut, or lower gamma",
-    "supply": "inputs beyond %.3g act no more than that does, but all are expected to act as they were "
-    "asked: from here on they are cut there; declare Plant(supply=...), also if it is another one",
+    "supply": "inputs beyond %.3g act no more than that does, but all are expected to act as "
+    "asked: plans are cut there from here on; declare Plant(supply=...), also if it is another one",
     "beyond": "a state was beyond the limits by %.3g after %d steps, but inputs are chosen so that "
     "none is: raise their margin or steps, and check the known part",
     "narrow": "the first 500 states cover %.2g %% of the box along %s, but the model is to hold in "

@@ -13,7 +13,7 @@ event                   meaning
 ``lost``                a state that could not be used, after which the present one is unknown
 ``counted``             something that changes nothing, by the name of its count
 ``refit``, ``fitted``,  parameters of the model, and values of the constants, delay and lag, that
-``rows``, ``supply``,   a fit to so many rows has found, with the level at which inputs are cut where
+``rows``, ``supply``,   a fit to so many rows has found, with the level at which inputs are cut if
 ``beside``              it found one; or the posterior of Gaussian processes with them is made
                         beside the one in force
 ``renewed``             that posterior, with the samples since, comes into force

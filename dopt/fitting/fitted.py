@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model, data_of, measured_names
@@ -37,6 +39,9 @@ USEFUL = 0.5
 
 CORRELATED = 0.7
 """Correlation of residuals with the row before from which the equations lack something."""
+
+DRAWN = 100
+"""Parameters, with initial states, that bounds are drawn from: an angle may turn either way."""
 
 TOLD_APART = 0.1
 """Largest standard error of delay and lag that are told apart, by their sizes together."""
@@ -192,42 +197,49 @@ class Fitted:
         history : float, optional
             Seconds of the beginning to which the initial state is fitted; half a window by default.
         level : float
-            Share of measurements that the bounds are to hold: of the uncertainty of the parameters
-            and of the initial state, and of the noise.
+            Share of measurements that the bounds are to hold: of simulations with other likely
+            parameters and initial states, and of the errors of held-out predictions, widened until
+            they hold as many of these.
 
         Raises
         ------
         SpecificationError
             If the log does not fit the plant, or no piece of it is longer than the history.
         """
-        from scipy.stats import norm
-
         if not 0 < level < 1:
             raise SpecificationError(
                 f"level is {level!r}, but a share between 0 and 1 is expected: give for instance "
                 f"0.9."
             )
-        data, z = self._with(run), float(norm.ppf(0.5 + 0.5 * level))
+        data, z = self._with(run), float(ndtri(0.5 + 0.5 * level))
         model, solution, _, covariance = self.chosen
-        simulator = Simulator(model, data)
+        simulator, measured = Simulator(model, data), model.structure.measured
         seconds = 0.5 * self.selection.window if history is None else float(history)
-        out = []
-        for rows in self._whole(data, seconds):
-            first, middle, last = rows
-            window = Windows(np.array([[first, middle]]), first_states(data, model, rows[None, :2]))
+        rng, out = np.random.default_rng(self.selection.seed), []
+        values, vectors = np.linalg.eigh(covariance)
+        drawn = rng.standard_normal((DRAWN, model.q)) * np.sqrt(np.maximum(values, 0.0))
+        changes, others = drawn @ vectors.T, rng.standard_normal((DRAWN, model.d))
+        for first, middle, last in self._whole(data, seconds):
+            rows = np.array([[first, middle]])
+            window = Windows(rows, first_states(data, model, rows))
             window = simulator.settled(solution.p, window)
-            states, S = simulator.slopes(solution.p, first, last, window.starts[0])
-            linear = simulator.linear(solution.p, window, np.ones(1))
-            inverse = np.linalg.pinv(linear.T[0])
-            measured = model.structure.measured
-            by_start = S[:, measured, model.q :] @ inverse
-            by_p = S[:, measured, : model.q] - by_start @ linear.C[0]
-            variance = np.einsum("tnq,qr,tnr->tn", by_p, covariance, by_p)
-            variance += np.square(by_start).sum(axis=2)
-            variance += np.square(
-                self.errors_ahead(data.time[first : last + 1] - data.time[middle])
+            start, linear = window.starts[0], simulator.linear(solution.p, window, np.ones(1))
+            states = simulator.states(solution.p, first, last, start)
+            inverse, C = np.linalg.pinv(linear.T[0]), linear.C[0]
+            likely = [
+                simulator.states(solution.p + step, first, last, start + inverse @ (own - C @ step))
+                for step, own in zip(changes, others, strict=True)
+            ]
+            noise = self._widening(level) * z
+            noise = noise * self.errors_ahead(data.time[first : last + 1] - data.time[middle])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of rows that none has reached
+                ends = np.nanquantile(likely, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+            centre = states[:, measured]
+            low, high = (
+                centre + side * np.hypot(np.maximum(side * (end[:, measured] - centre), 0.0), noise)
+                for side, end in zip((-1, 1), ends, strict=True)
             )
-            low, high = (states[:, measured] + side * np.sqrt(variance) for side in (-z, z))
             recorded = np.isfinite(data.measured[first : last + 1]).any(axis=1)
             recorded |= self.hold == "zero"  # a linear hold adds rows
             parts = (data.time[first : last + 1], states, low, high)
@@ -279,26 +291,34 @@ class Fitted:
         found["linear"] = [linear_predictions(self.data, data, rows, self.delay, step)]
         return found
 
-    def coverage(self, level: float = 0.9) -> dict[str, float]:
-        """Return the share of held-out measurements within the bounds of predictions at a level.
-
-        The bounds come from the errors of the other blocks; NaN with a single one.
-        """
-        from scipy.stats import norm
-
-        z, parts = float(norm.ppf(0.5 + 0.5 * level)), self._held_out["model"]
-        held = np.zeros((2, len(self._deviations)))  # inside, and all
+    @functools.cached_property
+    def _ratios(self) -> list[Array]:
+        """Errors of held-out predictions by the ones of the other blocks so far ahead, by state."""
+        parts, found = self._held_out["model"], [[np.empty(0)] for _ in self._deviations]
         for i, part in enumerate(parts):
             others = [each for j, each in enumerate(parts) if j != i]
             for seconds, error, change in zip(part.seconds, part.errors, part.changes, strict=True):
                 if not others:
                     break
-                bound = z * errors_ahead(others, self.horizons, seconds, self._deviations)
-                seen = np.isfinite(change)
-                held += (seen & (np.abs(error) <= bound)).sum(axis=0), seen.sum(axis=0)
-        with np.errstate(invalid="ignore"):
-            shares = held[0] / held[1]
-        return dict(zip(self.noise, shares.tolist(), strict=True))
+                size = errors_ahead(others, self.horizons, seconds, self._deviations)
+                for column, r, seen in zip(found, (error / size).T, change.T, strict=True):
+                    column.append(np.abs(r[np.isfinite(seen)]))
+        return [*map(np.concatenate, found)]
+
+    def coverage(self, level: float = 0.9) -> dict[str, float]:
+        """Return the share of held-out measurements within the bounds of predictions at a level.
+
+        The bounds come from the errors of the other blocks; NaN with a single one.
+        """
+        z = float(ndtri(0.5 + 0.5 * level))
+        shares = [float(np.mean(r <= z)) if len(r) else math.nan for r in self._ratios]
+        return dict(zip(self.noise, shares, strict=True))
+
+    def _widening(self, level: float) -> Array:
+        """Return the factor, (n,), at least 1, by which wider bounds hold as many as they say."""
+        z = float(ndtri(0.5 + 0.5 * level))
+        wide = [np.quantile(r, level) / z if len(r) else 1.0 for r in self._ratios]
+        return np.maximum(1.0, wide)
 
     def whiteness(self) -> dict[str, tuple[float, float]]:
         """Return two correlations of the residuals of each measured state.

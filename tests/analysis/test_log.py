@@ -335,6 +335,11 @@ def test_what_a_file_holds_is_said_if_it_is_no_table(tmp_path: Path) -> None:
         read_table(tmp_path / "mixed.mat")
 
 
+def test_variables_of_another_length_are_said(tmp_path: Path) -> None:
+    savemat(tmp_path / "run.mat", {**frame().to_dict("list"), "edges": np.zeros(7)})
+    assert analysis.read_log(tmp_path / "run.mat").notes[0].endswith("left out: edges (7).")
+
+
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "run.h5").write_bytes(b"")
     monkeypatch.setitem(sys.modules, "h5py", None)
