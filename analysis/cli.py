@@ -225,7 +225,7 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
         *(reader, selection, _plot_options(options), options.out, tuple(options.only or NAMES)),
         force=options.force,
     ):
-        say(f"{options.out / outcome.name}: {outcome.state}")
+        tell(sys.stdout, f"{options.out / outcome.name}: {outcome.state}\n")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
     return 1 if empty else 0
 
@@ -249,7 +249,7 @@ def _animate(options: argparse.Namespace) -> int:
         seed = median_seed(losses) if options.seed is None else options.seed
         story = film.tell(reader, entry, seed, options.frames)
     film.shoot(story, target, options.fps)
-    say(f"{target}: seed {seed}, {len(story.steps)} pictures")
+    tell(sys.stdout, f"{target}: seed {seed}, {len(story.steps)} pictures\n")
     return 0
 
 
@@ -278,11 +278,6 @@ def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
     if form == "csv":
         return table.to_csv(index=False)
     return text_table.latex() if form == "latex" else text_table.markdown()
-
-
-def say(text: str) -> None:
-    """Print one line of progress."""
-    tell(sys.stdout, f"{text}\n")
 
 
 def _add_serve(commands: argparse._SubParsersAction[Parser]) -> None:

@@ -25,23 +25,23 @@ TIMEOUT_SECONDS = 10.0
 MAX_CONCURRENT = 2
 
 EXAMPLES = (
-    ("Where the grid stands", "SELECT env, policy, width, n_done, n_diverged, n_failed, n_pending\n"
-     "FROM v_progress ORDER BY env, policy, width"),
-    ("Final losses", "SELECT env, policy, width, count(*) AS n, avg(final_loss) AS mean,\n"
+    ("Where the grid stands", "SELECT env, label, n_done, n_diverged, n_failed, n_pending\n"
+     "FROM v_progress ORDER BY env, label"),
+    ("Final losses", "SELECT env, label, count(*) AS n, avg(final_loss) AS mean,\n"
      "       min(final_loss) AS best, max(final_loss) AS worst\n"
-     "FROM v_trial WHERE status = 'done'\nGROUP BY env, policy, width ORDER BY env, mean"),
-    ("A curve with its standard error", "SELECT t, mean, standard_error, n FROM v_curve_stats\n"
-     "WHERE env = 'pendulum' AND policy = 'd_optimal' AND width = 16\nORDER BY t"),
-    ("The ten worst trials", "SELECT env, policy, width, seed, final_loss, trial_key\n"
+     "FROM v_trial WHERE status = 'done'\nGROUP BY config_key, env, label ORDER BY env, mean"),
+    ("A curve with its standard error", "SELECT label, t, mean, standard_error, n\n"
+     "FROM v_curve_stats WHERE env = 'pendulum' AND policy = 'd_optimal'\nORDER BY config_key, t"),
+    ("The ten worst trials", "SELECT env, label, seed, final_loss, trial_key\n"
      "FROM v_trial WHERE status = 'done' ORDER BY final_loss DESC LIMIT 10"),
-    ("What failed, and why", "SELECT env, policy, seed, cause, type, message\n"
+    ("What failed, and why", "SELECT env, label, seed, cause, type, message\n"
      "FROM v_failures ORDER BY ended DESC"),
-    ("Time and memory", "SELECT env, policy, width, avg(wall_seconds) AS wall_s,\n"
+    ("Time and memory", "SELECT env, label, avg(wall_seconds) AS wall_s,\n"
      "       max(peak_memory_bytes) / 1048576 AS peak_mib\n"
-     "FROM v_trial WHERE status = 'done'\nGROUP BY env, policy, width ORDER BY wall_s DESC"),
-    ("Control results", "SELECT env, policy, t, count(*) AS n, avg(value) AS success_rate\n"
+     "FROM v_trial WHERE status = 'done'\nGROUP BY config_key, env, label ORDER BY wall_s DESC"),
+    ("Control results", "SELECT env, label, t, count(*) AS n, avg(value) AS success_rate\n"
      "FROM v_assessment WHERE measure = 'control_success'\n"
-     "GROUP BY env, policy, t ORDER BY env, policy, t"),
+     "GROUP BY config_key, env, label, t ORDER BY env, label, t"),
     ("Launches", "SELECT launch_id, state, started, ended, host, git_commit\n"
      "FROM launch ORDER BY launch_id DESC"),
 )  # fmt: skip

@@ -46,6 +46,9 @@ _ESCAPED |= {"<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}"}
 _ESCAPED |= {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
 _ESCAPED |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
 
+_SIGNS = str.maketrans({"±": "+-", "×": "x", "≤": "<=", "≥": ">=", "–": "-", "−": "-", "‖": "|"})
+"""Signs whose names say nothing by their last word, as ASCII."""
+
 _JUDGED = {
     Measure.FINAL: "final loss",
     Measure.AUC: "loss over the whole curve (geometric mean over the steps)",
@@ -101,7 +104,7 @@ def _ascii(text: str) -> str:
     """Return the nearest ASCII text, letters without one as their names, no combining marks."""
     return "".join(
         letter if letter.isascii() else unicodedata.name(letter, "?").lower().rpartition(" ")[2]
-        for letter in unicodedata.normalize("NFKD", text)
+        for letter in unicodedata.normalize("NFKD", text.translate(_SIGNS))
         if not unicodedata.combining(letter)
     )
 

@@ -7,6 +7,7 @@ another launch finds that its process is gone.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,7 @@ from orchestrate.store.records import (
 )
 from orchestrate.store.schema import (
     CONFIG_COLUMNS,
+    ENDED,
     FINISHED,
     LAUNCH_STATES,
     OUTCOME_COLUMNS,
@@ -536,14 +538,8 @@ def _take_over(
 
 
 def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Registration:
-    counts = dict.fromkeys(("done", "diverged", "failed", "cancelled"), 0)
-    elsewhere = 0
-    todo = []
-    for key, (status, owner) in found.items():
-        if status in counts:
-            counts[status] += 1
-        elif status == "running" and owner != launch_id:
-            elsewhere += 1
-        else:
-            todo.append(key)
-    return Registration(total=len(found), **counts, running_elsewhere=elsewhere, todo=todo)
+    counts = Counter(status for status, _ in found.values())
+    open_ = {key: owner for key, (status, owner) in found.items() if status not in ENDED}
+    todo = [key for key, owner in open_.items() if owner in (None, launch_id)]
+    ended = {status: counts[status] for status in ENDED}
+    return Registration(len(found), **ended, running_elsewhere=len(open_) - len(todo), todo=todo)

@@ -537,7 +537,7 @@ def _merge_trial(target: Target, one: Candidate, here: Row[Any] | None) -> str:
             return "identical"
         ahead = target.steps_ahead(here, curve) if row["grows"] else None
         if ahead is None or ahead == 0:
-            return "conflict"
+            return "conflicts"
         if ahead > 0:
             return "kept"
         target.clear(here)
@@ -552,16 +552,11 @@ def _count(merged: Merged, found: Sequence[tuple[str, dict[str, Any]]]) -> None:
     for fate, row in found:
         if fate == "added":
             merged.added[row["status"]] = merged.added.get(row["status"], 0) + 1
-        elif fate == "conflict":
-            merged.conflicts.append(_named(row))
-        elif fate in ("incomplete", "contradictory"):
-            getattr(merged, fate).append(_named(row))
+        elif fate in ("conflicts", "incomplete", "contradictory"):
+            name = TrialName(row["trial_key"], row["env"], row["policy"], row["seed"])
+            getattr(merged, fate).append(name)
         else:
             setattr(merged, fate, getattr(merged, fate) + 1)
-
-
-def _named(row: Mapping[str, Any]) -> TrialName:
-    return TrialName(row["trial_key"], row["env"], row["policy"], row["seed"])
 
 
 def _refuse_itself(url: str, other_url: str) -> None:

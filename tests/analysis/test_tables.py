@@ -171,9 +171,10 @@ def test_markdown_shows_counts_and_dashes() -> None:
         for part, value in (("", 1.0), ("_2se", 0.1), ("_median", 0.9), ("_iqm", 0.95))
     }
     counts = {"env": "arm", "policy": "random", "label": "random", "n": 98, "n_diverged": 2}
-    summary = summary_table(pd.DataFrame([counts | values])).markdown()
-    assert "1.00 ± 0.10" in summary
-    assert "Diverged trials are left out." in summary
+    summary = summary_table(pd.DataFrame([counts | values]))
+    assert "1.00 ± 0.10" in summary.markdown()
+    assert "Diverged trials are left out." in summary.markdown()
+    assert summary.latex().startswith("% Loss: mean +- 2 standard errors over n trials;")
 
 
 def test_every_caption_says_what_is_divided_by_what() -> None:

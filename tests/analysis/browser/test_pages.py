@@ -157,7 +157,7 @@ def use_sql(page: Page) -> None:
     expect(page.locator("#answer tbody tr")).to_have_count(12)
     with page.expect_download() as download:
         page.get_by_role("button", name="Download CSV").click()
-    assert download.value.path().read_text().startswith("env,policy,width,n,mean")
+    assert download.value.path().read_text().startswith("env,label,n,mean")
     box = page.get_by_label("Statement")
     box.fill("DELETE FROM trial")
     box.press("Control+Enter")
