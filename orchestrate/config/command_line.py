@@ -64,6 +64,9 @@ _NO_OPTION = re.compile(r"(null|\[.*\]|)\s*")
 _OF_TRIALS = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
 """Override of a key that may exist only in some options of a grid."""
 
+_NEEDED = re.compile(rf"~(?:{'|'.join((*LAUNCH_SECTIONS, *TRIAL_SECTIONS, 'width'))})(?:=.*)?")
+"""Deletion of what every launch reads."""
+
 _OF_HYDRA = re.compile(r"[+~]*hydra[./]")
 _OWN_GRIDS = re.compile(r"[+~]*(hydra/sweeper|hydra\.mode)=")
 
@@ -165,6 +168,10 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
     for word in flags.overrides:
         check_removed(word)
         check_removed(word.partition("=")[0])
+        if _NEEDED.fullmatch(word):
+            raise UsageError(
+                f"'{word}' deletes what a launch needs: leave it out, or give another value."
+            )
         own = _OWN_GRIDS.match(word)
         if own and word != "hydra/sweeper=grid":
             raise UsageError(
