@@ -414,8 +414,8 @@ class Contacts:
     def left_out(self) -> list[str]:
         """Name the bodies that touch at home, of which contacts are not counted, or deeper ones."""
         deeper = f"contacts less than {1e3 * DEEPER:g} mm deeper than where the file puts them"
-        said = (("contacts of bodies that touch in all positions", self.always),)
-        said += ((deeper, self.touching - self.always),)
+        always = "contacts of bodies that touch in all positions"
+        said = ((always, self.always), (deeper, self.touching - self.always))
         kind = self._engine.mjtObj.mjOBJ_BODY
         return [
             f"left out: {what}: "

@@ -167,30 +167,28 @@ class Problem:
         worst = math.log(float(np.max(errors / self.reference)) / ABOVE)
         return -0.5 * determinant / self.count + FLOOR * max(worst, 0.0) + 10.0 * broken
 
-    def _strains(self, motion: Motion, rigid: Array | None = None) -> Array:
-        """Return torques as shares of their limits, friction included, (T, n)."""
+    def strains(self, motion: Motion, rigid: Array | None = None) -> Array:
+        """Return the largest shares of the limits of torque, friction included, (n,)."""
         rates, (dry, viscous) = motion.velocities, self._friction
         friction = dry * np.tanh(rates / (0.01 * self.limits.velocity)) + viscous * rates
-        result: Array = (self.body.torques(motion, rigid) + friction) / self.limits.torque
-        return np.abs(result)
-
-    def strain(self, motion: Motion, rigid: Array | None = None) -> float:
-        """Return the largest share of the limits of torque, friction included."""
-        return float(self._strains(motion, rigid).max())
+        shares = np.abs(self.body.torques(motion, rigid) + friction) / self.limits.torque
+        result: Array = shares.max(axis=0)
+        return result
 
     def candidate(self, family: Family, numbers: Array) -> Candidate:
         """Return a motion with its score; its share is not known yet.
 
         It reaches as far as the torques allow, and has a penalty where bodies touch.
         """
-        reach = 1.0
+        reach = shorter = 1.0
         for _ in range(6):
+            reach *= shorter
             motion = family.motion(numbers, self.step, reach)
             rigid = self.body.regressor(motion)
-            strain = self.strain(motion, rigid)
+            strain = float(self.strains(motion, rigid).max())
             if strain <= ROOM:  # between these rows it may be larger
                 break
-            reach *= max(0.6, 0.98 * math.sqrt(ROOM / strain))
+            shorter = max(0.6, 0.98 * math.sqrt(ROOM / strain))
         looked = motion.positions[::3]
         touching = {row for row, _, _ in self.body.collisions(looked)}
         broken = max(strain - ROOM, 0.0)
@@ -202,7 +200,7 @@ class Problem:
     def obstacle(self, one: Candidate) -> str:
         """Say which torque is too large or which bodies touch at finer steps; "" if none do."""
         motion, body = one.motion(min(FINE, self.step)), self.body
-        strains = self._strains(motion).max(axis=0)
+        strains = self.strains(motion)
         if strains.max() > 1.0:
             k, limit = int(strains.argmax()), self.limits.torque
             taken = f"{strains[k] * limit[k]:.3g} of {limit[k]:g} {body.units[k]}"

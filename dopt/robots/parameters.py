@@ -326,7 +326,7 @@ class Identifiability:
         rows = unknowns.weighted(motion, rate).reshape(-1, len(unknowns))
         null, alone, sizes = _null_space(rows)
         basis = _sparse(null)
-        touched = basis.any(axis=0)
+        touched = np.abs(basis).max(axis=0, initial=0.0) > 0.0
         weak = [
             f"{one.name} ({100.0 * error:.0f} %)"
             for one, error, is_null in zip(unknowns.parameters, alone, touched, strict=True)

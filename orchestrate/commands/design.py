@@ -199,7 +199,8 @@ def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any
     motion = design.best.motion(1.0 / arguments.rate)
     document = head | _told(problem, design.best)
     document |= {"best": design.best.name, "candidates": _candidates(design), "gap": design.gap}
-    document["limits"] = problem.limits.shares(motion) | {"torque": problem.strain(motion)}
+    strain = float(problem.strains(motion).max())
+    document["limits"] = problem.limits.shares(motion) | {"torque": strain}
     written = []
     if arguments.out:
         _write_csv(arguments.out, problem, motion)

@@ -89,13 +89,16 @@ def test_the_bound_of_viscous_friction_alone_is_full_speed(arm: Body, limits: Li
     assert gap < 0.3
 
 
-def test_torque_limits_shorten_motions(arm: Body, limits: Limits) -> None:
-    weak = dataclasses.replace(limits, torque=limits.torque * np.array([0.03, 1.0, 1.0, 1.0]))
+@pytest.mark.parametrize("share", [0.03, 0.003])
+def test_torque_limits_shorten_motions(arm: Body, limits: Limits, share: float) -> None:
+    weak = dataclasses.replace(limits, torque=limits.torque * np.array([share, 1.0, 1.0, 1.0]))
     problem = Problem(arm, weak, "mass", 6.0)
     family = Multisine(weak, 6.0)
     one = problem.candidate(family, np.random.default_rng(1).standard_normal(family.size))
     assert one.reach < 1.0
-    assert not one.free or problem.strain(one.motion(0.04)) <= 1.0 + 1e-9
+    errors = problem.errors(problem.information(one.motion(problem.step)))
+    np.testing.assert_allclose(one.errors, errors)  # once of a longer motion, after many attempts
+    assert not one.free or problem.strains(one.motion(0.04)).max() <= 1.0 + 1e-9
 
 
 def test_viscous_friction_is_less_where_a_motion_is_slow(tmp_path: Path) -> None:
