@@ -430,7 +430,9 @@ class Log:
         for name in angles:
             if name not in self.states:
                 raise unknown_name("measured state in 'angles' of a log", name, self.states)
-        clock = clock_column(table, time, dt, notes)
+        taken = {column for group in named for column in group.values() if column != time}
+        rest = {name: values for name, values in table.items() if name not in taken}
+        clock = clock_column(rest, time, dt, notes)
         unit_of = _units_of(units or {}, named, clock)
         stamps = stamps_of(table, clock, time, dt, unit_of.get(clock or "time", 1.0), notes)
         measured, applied = (
@@ -492,7 +494,8 @@ class Log:
                 f"plant ({', '.join(plant.states)}): give columns={{state: column}}."
             )
         notes = []
-        if time is None and dt is None and not any(map(is_clock, table)):
+        taken = {*found.values(), *(renamed.get(name, name) for name in plant.inputs)}
+        if time is None and dt is None and not any(map(is_clock, {*table} - taken)):
             dt = float(plant.dt)
             notes.append(f"No column of stamps: rows are the plant's dt of {dt:g} s apart.")
         log = cls(
@@ -666,8 +669,8 @@ def outliers(values: Array, period: float = math.inf) -> Booleans:
     """Return which values, (N,), are far from most of those around them.
 
     Far is beyond 10 times the median second difference near, 1.5 times the median first one, which
-    an end stop turns, and 1.5 times the median change of the whole. Differences are taken within
-    half a period.
+    an end stop turns, and 1.5 times the median change of the whole, and beyond the way from those
+    before to those after. Differences are taken within half a period.
     """
     found = np.zeros(len(values), dtype=np.bool_)
     there = np.flatnonzero(np.isfinite(values))
@@ -686,11 +689,13 @@ def outliers(values: Array, period: float = math.inf) -> Booleans:
 
     first = turned(np.diff(y, prepend=y[0]))
     second = np.abs(turned(np.diff(first, append=first[-1])))
-    apart = np.median(np.abs(turned(around(y, AROUND) - y[:, None])), axis=1)
+    near = around(y, AROUND)
+    apart = np.median(np.abs(turned(near - y[:, None])), axis=1)
+    across = np.abs(turned(near[:, 3:, None] - near[:, None, :2])).min(axis=(1, 2))
     moved = np.abs(first[first != 0.0])
     usual = 10.0 * median(second) + 1.5 * median(np.abs(first))
     usual += 1.5 * float(np.median(moved)) if len(moved) else 0.0
-    found[there] = apart > usual
+    found[there] = apart > np.maximum(usual, across)
     return found
 
 
