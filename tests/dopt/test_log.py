@@ -239,7 +239,7 @@ def test_wrong_readings_of_an_encoder_are_left_out(size: float, wrapped: bool) -
     np.testing.assert_allclose(np.ptp((got - angle)[seen]), 0.0, atol=0.01)
     if size < TURN or not wrapped:
         assert set(np.flatnonzero(~seen)) == set(wrong)
-        assert said(found, "20 outliers of 'th' left out")
+        assert said(found, "20 outliers of th left out")
 
 
 def test_a_motion_with_corners_and_noise_has_no_outliers() -> None:
