@@ -665,7 +665,9 @@ def outliers(y: Array, period: float) -> Booleans:
         return sliding_window_view(np.pad(part, width // 2, mode="edge"), width)
 
     first = turned(np.diff(y, prepend=y[0]))
-    usual = 1.5 * float(np.median(np.abs(first[first != 0.0]))) if first.any() else 0.0
+    usual: Array = np.full(
+        len(y), np.median(1.5 * np.abs(first[first != 0.0])) if first.any() else 0
+    )
     for change, factor in ((turned(np.diff(first, append=first[-1])), 10.0), (first, 1.5)):
         usual = usual + factor * np.median(around(np.abs(change), NEAR), axis=1)
     near = around(y, 5)

@@ -376,8 +376,9 @@ class _Selection:
         uncut = found.cost(model, s)
         if min(map(cost, CUTS)) > (1.0 - LEAST_FALL) * uncut:
             return None
-        options = {"xatol": 0.01}
-        best = minimize_scalar(cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options=options)
+        best = minimize_scalar(
+            cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options={"xatol": 0.01}
+        )
         level, whole = float(f"{best.x * largest:.3g}"), cut_at(best.x)
         self.data = self.data._replace(inputs=np.clip(given, -level, level))
         scores, _ = self._validate(model, whole, s)
