@@ -277,9 +277,7 @@ class _Selection:
 
         def one(shift: int) -> tuple[float, Model, Solution]:
             model = self._model(self.delay + shift * self.step, free=False)
-            found = solve(
-                Simulator(model, self.data), some, model.prior, 1.0, most=12, tolerance=1e-3
-            )
+            found = solve(Simulator(model, self.data), some, model.prior, 1.0, most=12)
             counts = some.counts(self.data)
             return float(np.sqrt(np.median(found.squares / counts))), model, found
 
