@@ -31,14 +31,7 @@ GAP = 10.0
 
 TURN = 2.0 * math.pi
 
-UNITS = {
-    "rad": 1.0,
-    "mrad": 1e-3,
-    "deg": TURN / 360,
-    "rev": TURN,
-    "turn": TURN,
-    "rpm": TURN / 60,
-}
+UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360, "rev": TURN, "turn": TURN, "rpm": TURN / 60}
 """Units of angles, and what they are in radians; ``/s`` may follow, and ``counts/4096`` is one."""
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
@@ -46,8 +39,6 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-
 
 _ROLL_OVERS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
 """Times after which a 32-bit counter of µs or ms begins again [s]."""
-
-_COUNTER_BITS = (16, 32)
 
 _MISSING = ("", "na", "nan", "nat", "<na>", "n/a", "none", "null")
 
@@ -201,7 +192,7 @@ def values_of(
     factor = _factor(name, units[name], UNITS)
     notes.append(f"Column {name!r} is multiplied by {factor:.6g} ({units[name]}).")
     if str(units[name]).startswith("count"):
-        for bits in _COUNTER_BITS:
+        for bits in (16, 32):
             jumps = int((np.abs(np.diff(found[np.isfinite(found)])) > 0.9 * 2.0**bits).sum())
             if jumps:
                 notes.append(
@@ -326,6 +317,8 @@ def count_text(number: int, what: str) -> str:
 
 _ONE_TURN = TURN * 1.01  # a wrapped angle with its noise
 
+Rows = Sequence[npt.NDArray[np.intp]]
+
 
 class Piece(NamedTuple):
     """A stretch of a log without gaps.
@@ -430,7 +423,9 @@ class Log:
         for name in angles:
             if name not in self.states:
                 raise unknown_name("measured state in 'angles' of a log", name, self.states)
-        clock = clock_column(table, time, dt, notes)
+        taken = {column for group in named for column in group.values() if column != time}
+        rest = {name: values for name, values in table.items() if name not in taken}
+        clock = clock_column(rest, time, dt, notes)
         unit_of = _units_of(units or {}, named, clock)
         stamps = stamps_of(table, clock, time, dt, unit_of.get(clock or "time", 1.0), notes)
         measured, applied = (
@@ -441,11 +436,10 @@ class Log:
         usable = np.isfinite(stamps) & np.isfinite(applied).all(axis=1)
         rows = _without_gaps(stamps, usable, gap, notes)
         for i, name in enumerate(self.states):
-            period = TURN if name in angles else math.inf
-            measured[:, i] = _without_outliers(name, measured[:, i], rows, period, notes)
             if name in angles:
+                _leave_out(name, measured[:, i], rows, TURN, notes)
                 measured[:, i] = _unwrapped(name, measured[:, i], rows, notes)
-                measured[:, i] = _without_outliers(name, measured[:, i], rows, math.inf, notes)
+            _leave_out(name, measured[:, i], rows, math.inf, notes)
         start = stamps[rows[0][0]]
         if start:
             notes.append(f"Times count from the first usable stamp, {start:.10g} s.")
@@ -492,7 +486,8 @@ class Log:
                 f"plant ({', '.join(plant.states)}): give columns={{state: column}}."
             )
         notes = []
-        if time is None and dt is None and not any(map(is_clock, table)):
+        taken = {*found.values(), *(renamed.get(name, name) for name in plant.inputs)}
+        if time is None and dt is None and not any(map(is_clock, {*table} - taken)):
             dt = float(plant.dt)
             notes.append(f"No column of stamps: rows are the plant's dt of {dt:g} s apart.")
         log = cls(
@@ -567,9 +562,7 @@ def _units_of(
     return {places[name]: unit for name, unit in units.items()}
 
 
-def _without_gaps(
-    t: Array, usable: Booleans, gap: float | None, notes: list[str]
-) -> list[npt.NDArray[np.intp]]:
+def _without_gaps(t: Array, usable: Booleans, gap: float | None, notes: list[str]) -> Rows:
     """Return the rows of each piece, two at least."""
     if gap is not None and not gap > 0:
         raise SpecificationError(
@@ -632,9 +625,7 @@ def _out_of_order(t: Array, begins: Booleans) -> Booleans:
     return found
 
 
-def _unwrapped(
-    name: str, angle: Array, pieces: Sequence[npt.NDArray[np.intp]], notes: list[str]
-) -> Array:
+def _unwrapped(name: str, angle: Array, pieces: Rows, notes: list[str]) -> Array:
     """Return an angle that is followed over the ends of a turn within each piece."""
     used = angle[np.concatenate(pieces)]
     used = used[np.isfinite(used)]
@@ -655,61 +646,44 @@ def _unwrapped(
     return found
 
 
-AROUND, NEAR = 5, 31
-"""Values from most of which an outlier is far, and those that say what is usual around it."""
-
-MOST_OUTLIERS = 0.02
-"""Share of values from which they are no outliers."""
+NEAR, MOST_OUTLIERS = 31, 0.02
+"""Values that say what is usual, and the share of all from which there are no outliers."""
 
 
-def outliers(values: Array, period: float = math.inf) -> Booleans:
-    """Return which values, (N,), are far from most of those around them.
+def outliers(y: Array, period: float) -> Booleans:
+    """Return which of finite values, (N,), are far from most of the five around them.
 
-    Far is beyond 10 times the median second difference near, 1.5 times the median first one, which
-    an end stop turns, and 1.5 times the median change of the whole. Differences are taken within
-    half a period.
+    Far is beyond the way from those before to those after, and beyond 10 times the median second
+    difference near, 1.5 times the median first one, which an end stop turns, and 1.5 times the
+    median change of the whole. Differences are taken within half a period.
     """
-    found = np.zeros(len(values), dtype=np.bool_)
-    there = np.flatnonzero(np.isfinite(values))
-    if len(there) < NEAR:
-        return found
-    y = values[there]
 
     def turned(change: Array) -> Array:
-        return change if period == math.inf else change - period * np.round(change / period)
+        return change - (period * np.round(change / period) if period < math.inf else 0.0)
 
     def around(part: Array, width: int) -> Array:
         return sliding_window_view(np.pad(part, width // 2, mode="edge"), width)
 
-    def median(part: Array) -> Array:
-        return np.asarray(np.median(around(part, NEAR), axis=1))
-
     first = turned(np.diff(y, prepend=y[0]))
-    second = np.abs(turned(np.diff(first, append=first[-1])))
-    apart = np.median(np.abs(turned(around(y, AROUND) - y[:, None])), axis=1)
-    moved = np.abs(first[first != 0.0])
-    usual = 10.0 * median(second) + 1.5 * median(np.abs(first))
-    usual += 1.5 * float(np.median(moved)) if len(moved) else 0.0
-    found[there] = apart > usual
-    return found
+    usual: Array = np.full(
+        len(y), np.median(1.5 * np.abs(first[first != 0.0])) if first.any() else 0
+    )
+    for change, factor in ((turned(np.diff(first, append=first[-1])), 10.0), (first, 1.5)):
+        usual = usual + factor * np.median(around(np.abs(change), NEAR), axis=1)
+    near = around(y, 5)
+    across = np.abs(turned(near[:, 3:, None] - near[:, None, :2])).min(axis=(1, 2))
+    apart = np.median(np.abs(turned(near - y[:, None])), axis=1)
+    return np.asarray(apart > np.maximum(usual, across))
 
 
-def _without_outliers(
-    name: str,
-    values: Array,
-    pieces: Sequence[npt.NDArray[np.intp]],
-    period: float,
-    notes: list[str],
-) -> Array:
-    """Return a measured state with NaN in the place of outliers."""
-    rows = np.concatenate([each[outliers(values[each], period)] for each in pieces])
-    if not 0 < len(rows) <= MOST_OUTLIERS * len(values):
-        return values
-    kept = values.copy()
-    kept[rows] = np.nan
-    what = count_text(len(rows), "outlier")
-    notes.append(f"{what} of {name!r} left out, first row {rows[0]}: they stay missing.")
-    return kept
+def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> None:
+    """Write NaN in the place of the outliers of a measured state."""
+    there = [each[np.isfinite(y[each])] for each in pieces]
+    found = [each[outliers(y[each], period)] for each in there if len(each) >= NEAR]
+    rows = np.concatenate([*found, np.empty(0, np.intp)])
+    if 0 < len(rows) <= MOST_OUTLIERS * len(y):
+        notes.append(f"{count_text(len(rows), 'outlier')} of {name} left out, first row {rows[0]}.")
+        y[rows] = np.nan
 
 
 def _note_missing(names: Sequence[str], measured: Array, notes: list[str]) -> None:

@@ -98,7 +98,7 @@ class InFlight:
         if other._flight is not None:
             other._flight.settle(self._departed[0])
             for u in self._departed:
-                other._flight.depart(u)
+                other._flight.depart(other.cut(u))
         other._last, other._departed = self._last, self._departed
         return other
 

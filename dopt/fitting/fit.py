@@ -277,9 +277,7 @@ class _Selection:
 
         def one(shift: int) -> tuple[float, Model, Solution]:
             model = self._model(self.delay + shift * self.step, free=False)
-            found = solve(
-                Simulator(model, self.data), some, model.prior, 1.0, most=12, tolerance=1e-3
-            )
+            found = solve(Simulator(model, self.data), some, model.prior, 1.0, most=12)
             counts = some.counts(self.data)
             return float(np.sqrt(np.median(found.squares / counts))), model, found
 
@@ -376,8 +374,9 @@ class _Selection:
         uncut = found.cost(model, s)
         if min(map(cost, CUTS)) > (1.0 - LEAST_FALL) * uncut:
             return None
-        options = {"xatol": 0.01}
-        best = minimize_scalar(cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options=options)
+        best = minimize_scalar(
+            cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options={"xatol": 0.01}
+        )
         level, whole = float(f"{best.x * largest:.3g}"), cut_at(best.x)
         self.data = self.data._replace(inputs=np.clip(given, -level, level))
         scores, _ = self._validate(model, whole, s)

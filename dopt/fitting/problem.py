@@ -243,7 +243,7 @@ class Solution(NamedTuple):
     converged: bool
 
     def cost(self, model: Model, s: float) -> float:
-        """Return what was minimised, with the prior of all deviations 1."""
+        """Return what is minimised."""
         prior = np.sum((self.p - model.prior) ** 2)
         return float(robust(self.squares, self.scale).sum() / s**2 + prior)
 
@@ -270,18 +270,14 @@ def solve(
     most: int = 30,
     scale: Array | None = None,
     tolerance: float = 1e-3,
-    deviations: Array | float = 1.0,
-    say: Any = None,
 ) -> Solution:
     """Minimise over p and the initial states, from given ones."""
     model, counts = simulator.model, windows.counts(simulator.data)
     squares = simulator.squares(p, windows)
     scale = robust_scale(squares, counts) if scale is None else scale
-    precision = np.broadcast_to(1.0 / np.square(deviations), (model.q,))
 
     def cost(squares: Array, p: Array) -> float:
-        prior = np.sum(precision * (p - model.prior) ** 2)
-        return float(robust(squares, scale).sum() / s**2 + prior)
+        return Solution(p, windows, squares, scale, 0, False).cost(model, s)
 
     value, damping, calm, steps = cost(squares, p), FIRST_DAMPING, 0, 0
     converged = False
@@ -289,7 +285,7 @@ def solve(
         steps += 1
         weights = 1.0 / (1.0 + squares / scale)
         linear = simulator.linear(p, windows, weights / s**2)
-        H, b = linear.normal + np.diag(precision), linear.slope - precision * (p - model.prior)
+        H, b = linear.normal + np.eye(model.q), linear.slope - (p - model.prior)
         possible = b @ np.linalg.solve(H, b)  # fall that is foreseen without damping
         growth, new = 2.0, math.inf
         size = max(np.trace(H) / max(model.q, 1), 1.0)
@@ -320,8 +316,6 @@ def solve(
         ratio = fall / foreseen if foreseen > 0.0 else 1.0
         damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), LEAST_DAMPING)
         p, windows, squares = trial, moved, after
-        if say:
-            say(f"  step {steps}: cost {new:.6g}, fall {fall / value:.1e}, damping {damping:.0e}")
         small = fall < tolerance * value and possible < 10.0 * tolerance * value
         calm = calm + 1 if small and not len(held) else 0
         value, converged = new, calm >= 2

@@ -141,7 +141,7 @@ def _section_of(given: Any) -> Any:
 
 def _from_section(given: Any) -> Any:
     if isinstance(given, Mapping):
-        return Encoder(**given) if "counts" in given else Unknown(**given)
+        return Encoder(**given) if "counts" in given else unknown(**given)
     return given
 
 
@@ -363,7 +363,8 @@ class Plant:
     def from_mapping(cls, given: Mapping[str, Any]) -> Plant:
         """Return the plant that a mapping of its arguments describes, such as a YAML file.
 
-        An unknown number is ``{value, factor}`` or ``{value, spread}``, an encoder ``{counts}``.
+        An unknown number is ``{value}``, ``{value, factor}`` or ``{value, spread}``, as of
+        :func:`unknown`, an encoder ``{counts}``.
 
         Raises
         ------

@@ -137,7 +137,7 @@ def judged(case: Case, name: str, given: Sequence[Log], left_out: Log, workers: 
     """Fit a plant to logs, and return the errors on another one, also of the reference."""
     fitted = fit(case.plant, given, workers=workers, **case.options)
     own, alone = fitted.chosen, fitted.physics
-    data = data_of(case.plant, [left_out], fitted.hold, fitted.data.deviations)
+    data = data_of(fitted.plant, [left_out], fitted.hold, fitted.data.deviations)
     rows = windows(case, data)
     ours = _errors(case, Simulator(own.model, data), own.solution.p, rows)
     if case.reference is None:

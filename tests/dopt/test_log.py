@@ -120,6 +120,15 @@ def test_dates_may_be_missing_and_change_their_offset() -> None:
     np.testing.assert_allclose(found.pieces[1].time, T[150:-1], atol=1e-9)
 
 
+def test_a_state_that_is_called_like_a_clock_is_none() -> None:
+    """Of a temperature."""
+    columns = {"T": np.sin(T), "u": np.cos(T)}
+    given: dict[str, Any] = {"states": {"T": "K"}, "known": {"T": "u"}, "learned": ["T"]}
+    plant = dopt.Plant(**given, inputs={"u": "W"}, dt=0.01, gamma=1.0, box={"T": 1.0})
+    for more in ({"time": T}, {}):
+        np.testing.assert_allclose(Log.for_plant(columns | more, plant).pieces[0].time, T)
+
+
 def test_a_clock_in_a_group_is_found() -> None:
     found = Log({"run.t": T, "run.th": T, "run.u": T}, states=["run.th"], inputs=["run.u"])
     np.testing.assert_array_equal(found.pieces[0].time, T)
@@ -230,13 +239,14 @@ def test_wrong_readings_of_an_encoder_are_left_out(size: float, wrapped: bool) -
     np.testing.assert_allclose(np.ptp((got - angle)[seen]), 0.0, atol=0.01)
     if size < TURN or not wrapped:
         assert set(np.flatnonzero(~seen)) == set(wrong)
-        assert said(found, "20 outliers of 'th' left out")
+        assert said(found, "20 outliers of th left out")
 
 
 def test_a_motion_with_corners_and_noise_has_no_outliers() -> None:
     rng, t = np.random.default_rng(0), np.arange(3000.0)
     for noise in (0.0, 0.1):
-        for motion in (np.abs(t % 40 - 20), np.sign(np.sin(0.03 * t)), np.floor(0.05 * t), 0.0 * t):
+        falls = 20.0 * np.exp(-0.2 * (t % 200))  # as a tank empties
+        for motion in (np.abs(t % 40 - 20), np.sign(np.sin(0.03 * t)), falls, 0.0 * t):
             found = log({"t": t, "th": motion + noise * rng.normal(size=3000), "u": t})
             assert not said(found, "outlier")
 

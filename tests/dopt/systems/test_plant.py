@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt import Plant
+from dopt import Plant, unknown
 from dopt.assessment import true_parameters
 from dopt.errors import SpecificationError
 from dopt.kernel.equations import compiled_equations
@@ -78,6 +78,12 @@ def test_a_plant_is_read_back_from_its_section(plant: Plant) -> None:
     assert again.to_section() == system.to_section()  # type: ignore[attr-defined]
     assert (again.state_labels, again.learned_rows) == (system.state_labels, system.learned_rows)
     assert again.horizon == 9
+
+
+def test_an_unknown_number_of_a_file_may_have_a_value_alone() -> None:
+    declared = {field.name: getattr(MOTOR, field.name) for field in dataclasses.fields(MOTOR)}
+    plant = Plant.from_mapping({**declared, "constants": {"gain": {"value": 40.0}}})
+    assert plant.constants == {"gain": unknown(40.0)}
 
 
 @pytest.mark.parametrize(
