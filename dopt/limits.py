@@ -19,6 +19,7 @@ import numpy as np
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, parameter, unvalidated
+from dopt.registry import is_none
 from dopt.systems.base import System
 from dopt.types import Array
 
@@ -159,10 +160,9 @@ def limits_from(section: object) -> Limits | None:
             f"configuration key 'limits' is {section!r}, but a section with a name and fields is "
             f"expected: choose limits=box, or limits=none."
         )
-    name = section.get("name", Limits.name)
-    if name == "none":
+    if is_none("limits", section):
         return None
-    if name not in LIMITS:
+    if (name := section.get("name", Limits.name)) not in LIMITS:
         raise unknown_name("limits", name, [*LIMITS, "none"])
     return Limits.from_section(section)
 

@@ -58,6 +58,18 @@ def build(section: str, registry: Mapping[str, type[T]], given: Part) -> T:
     return cls(**{key: value for key, value in given.items() if key not in _ABOUT})
 
 
+def is_none(section: str, given: Mapping[str, object]) -> bool:
+    """Return True for a section of the name "none", which has no other keys."""
+    if given.get("name") != "none":
+        return False
+    if others := ", ".join(key for key in map(str, given) if key != "name"):
+        raise SpecificationError(
+            f"{section}=none has {others}, but no other key than its name is expected: leave it "
+            f"out, or choose an option that has it."
+        )
+    return True
+
+
 def section_of(item: Validated) -> dict[str, object]:
     """Return the configuration section that :func:`build` turns into ``item``."""
     if hasattr(item, "to_section"):  # of something that is no dataclass of ours

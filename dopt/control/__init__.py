@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from dopt.control.task import Control
 from dopt.errors import SpecificationError
-from dopt.registry import build
+from dopt.registry import build, is_none
 
 TASKS: dict[str, type[Control]] = {Control.name: Control}
 
@@ -24,7 +24,7 @@ def task_from(section: object) -> Control | None:
             f"configuration key 'task' is {section!r}, but a section with a name and fields is "
             f"expected: choose task=control, or task=none."
         )
-    return None if section.get("name") == "none" else build("task", TASKS, section)
+    return None if is_none("task", section) else build("task", TASKS, section)
 
 
 __all__ = ["TASKS", "Control", "task_from"]
