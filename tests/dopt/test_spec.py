@@ -409,7 +409,8 @@ def test_another_kind_of_thing_is_refused_in_a_sentence(
 
 @pytest.mark.parametrize("section", ["limits", "task"])
 def test_an_option_none_takes_nothing_else(section: str) -> None:
-    given = {**trial("cartpole", "random").to_mapping(), section: {"name": "none", "steps": 3}}
+    spec = trial("cartpole", "random")
+    given = {**spec.to_mapping(), section: {"name": "none", "steps": 3}}
     with pytest.raises(SpecificationError, match=f"{section}=none has steps, but no other key"):
         TrialSpec.from_mapping(given)
-    assert TrialSpec.from_mapping({**given, section: {"name": "none"}}) == trial("cartpole", "random")
+    assert TrialSpec.from_mapping({**given, section: {"name": "none"}}) == spec
