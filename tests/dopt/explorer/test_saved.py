@@ -185,7 +185,7 @@ def test_it_is_not_compared_with_simulated_trials(sqlite_url: str) -> None:
         selection = select(reader, Filter())
         assert selection.labels == ("D-optimal, prequential loss", "random, prequential loss")
         assert not selection.gaps
-        with pytest.raises(AnalysisError, match="but no simulated trial is selected"):
+        with pytest.raises(AnalysisError, match=r"the selection \(no simulated trial\) has none"):
             compare_policies(reader, selection)
 
 
