@@ -107,7 +107,7 @@ def _is_real(given: object, kinds: str = "fiu") -> bool:
 
 
 def as_array(given: Any) -> npt.NDArray[Any]:
-    """Return an array of anything; of objects if it is none, such as lists of two lengths."""
+    """Return an array of anything; of objects where numbers do not make one."""
     try:
         return np.asarray(given)
     except ValueError:  # rows of different lengths
