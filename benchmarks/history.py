@@ -21,10 +21,10 @@ from dopt.process import usable_cores
 FEWEST = 3
 """Runs of a row before its median says anything."""
 
-SLOWER, SLOWER_ELSEWHERE = 1.2, 2.5
+SLOWER, SLOWER_ELSEWHERE = 1.2, 2.0
 """Times the median at which a row counts as slower: on the same processor, where the medians of
 runs on an idle and on a busy machine differ by a few per cent; beside other processors, where rows
-took up to 2.1 times as long beside the calibration."""
+took up to 1.8 times as long beside the calibration."""
 
 
 @dataclass(frozen=True)
