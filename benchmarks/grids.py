@@ -87,9 +87,12 @@ def expansion(quick: bool) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         url = f"store.url={database(folder)}"
         dry = "launch.dry_run=true"
-        runs = [launch("-m", *PAPER, dry, url) for _ in range(3)]
+        runs, fixed = [], [fixed_seconds(interpreter)]
+        for _ in range(3):
+            runs.append(launch("-m", *PAPER, dry, url))
+            fixed.append(fixed_seconds(interpreter))
         seconds, cpu = min(one.seconds for one in runs), min(one.cpu_seconds for one in runs)
-        timing = Timing(cpu, "s", fixed_seconds(interpreter))
+        timing = Timing(cpu, "s", min(fixed))
         note = f"dry run, {cpu:.2f} s of CPU"
         small = Row("2,000 jobs expanded", seconds, "s", Target(4, 2), None, note, timing)
         if quick:

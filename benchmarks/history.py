@@ -47,11 +47,12 @@ class Run:
         return cls(date, _commit(), " ".join(describe()), processor())
 
     def add(self, question: str, rows: Sequence[Row], calibration: float) -> None:
-        """Take in those rows of a question that are times or rates."""
+        """Take in the rows of a question that are times or rates; of two, the cheaper one stays."""
         for row in rows:
             if row.value and (row.unit in TIMES or row.unit.endswith("/s")):
                 timing = row.timing or Timing(row.value, row.unit, calibration)
-                self.rows[f"{question}: {row.what}"] = timing
+                name = f"{question}: {row.what}"
+                self.rows[name] = min(timing, self.rows.get(name, timing), key=lambda one: one.cost)
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,10 @@ class Slower:
     times: float
     runs: int
     elsewhere: bool
+
+    @property
+    def question(self) -> str:
+        return self.name.partition(": ")[0]
 
     def __str__(self) -> str:
         where = " on all processors" if self.elsewhere else ""

@@ -107,7 +107,7 @@ def trial(quick: bool) -> list[Row]:
     code: how long it takes for so few points is not known.
     """
     specs = {"default": cartpole(), "large": cartpole(grid=LARGE_GRID)}
-    rounds = 4 if quick else 6
+    rounds = 8 if quick else 12
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in specs}
     fixed = []
     for seed in range(-1, rounds):

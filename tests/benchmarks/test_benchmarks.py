@@ -196,6 +196,20 @@ def test_the_command_fails_where_a_row_became_slower(
     assert len(read(tmp_path / "history.jsonl")) == 2
 
 
+def test_a_slower_row_is_measured_again_and_its_quickest_time_counts(
+    past: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "fixed_seconds", lambda: 0.01)
+    monkeypatch.setattr(history, "processor", lambda: "usual")
+    kept = tmp_path / "history.jsonl"
+    arguments = ["--only", "step", "--history", str(kept), "--against", str(past)]
+    for values, status in (([170.0, 150.0, 101.0], 0), ([170.0, 150.0, 130.0, 101.0], 1)):
+        times = iter(values)
+        monkeypatch.setattr(kernel, "step", lambda _, t=times: [Row("D-optimal", next(t), "µs")])
+        assert main(arguments) == status
+    assert [run.rows["step: D-optimal"].value for run in read(kept)] == [101.0, 130.0]
+
+
 def result_of(microseconds: np.ndarray) -> TrialResult:
     """Return what the benchmarks read of a trial: the times of its steps."""
     return cast("TrialResult", SimpleNamespace(plan_us=microseconds, learn_us=np.zeros(500)))
