@@ -36,7 +36,7 @@ SIGNS = {
     "beyond": "states beyond the limits",
     "narrow": "sides of the box of which the first 500 states cover less than a tenth",
 }
-"""What is counted of each sign."""
+"""Meaning of the counts."""
 
 STORED = {name: said for name, said in SIGNS.items() if name != "beyond"}
 """Signs that are stored by these names; states beyond limits are stored as violations."""

@@ -50,7 +50,7 @@ LARGEST_DAMPING = 1e12
 """Damping, by the mean precision of a parameter, at which no step is short enough."""
 
 STUCK = 1e12
-"""What a window that leaves the limit counts for, by c."""
+"""Size of a window that leaves the limit, by c."""
 
 
 class Linear(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 PLAIN = os.environ.get("DOPT_PLAIN", "0") not in ("", "0")
-"""Whether the kernel runs in the interpreter. Set the variable before Python starts."""
+"""True if the kernel runs in the interpreter. Set the variable before Python starts."""
 
 
 def power_of_two(shifted: Any) -> Any:

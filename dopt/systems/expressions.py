@@ -27,7 +27,7 @@ FUNCTIONS = {
 _ARGUMENTS = {"where": 3}  # 1 of the others
 
 _WRITTEN = {"abs": "magnitude(x)", "fabs": "magnitude(x)", "sqrt": "x ** 0.5", "pow": "x ** y"}
-"""What to write in place of functions that people expect."""
+"""Names to write in place of functions that people expect."""
 
 _TRIED = 64
 """Values of each state and input, of all sizes and both signs, at which expressions are tried."""

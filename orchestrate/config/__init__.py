@@ -139,10 +139,19 @@ LARGEST = 1_000_000_000
 _PRECISION = re.compile(r"ci\s*<\s*(\d+(?:\.\d+)?)\s*%")
 
 
+class _Section(dict[str, Any]):
+    """Settings, of which a missing one has been deleted."""
+
+    def __missing__(self, name: str) -> Any:
+        raise LaunchError(
+            f"an override deletes '{name}', which a launch needs: leave that override out."
+        )
+
+
 def section(key: str, value: object) -> Mapping[str, Any]:
     """Return a mapping of settings."""
     if isinstance(value, Mapping):
-        return value
+        return _Section(value)
     raise wrong(key, value, "a section with settings of its own")
 
 

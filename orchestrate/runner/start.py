@@ -376,12 +376,7 @@ def checked(request: Request) -> tuple[Grid, LaunchSettings]:
     from orchestrate.config.options import check_launch
 
     grid = build_grid(request.combinations, single=request.single)
-    try:
-        settings = LaunchSettings.from_mapping(request.launch)
-    except KeyError as error:
-        raise LaunchError(
-            f"an override deletes {error}, which a launch needs: leave that override out."
-        ) from error
+    settings = LaunchSettings.from_mapping(request.launch)
     check_launch(request.launch)
     path = executor_factory(settings).path
     if path != "kernel":

@@ -68,7 +68,7 @@ CASES = {
         controller=plants.BALANCER,
     ),
 }
-"""What is fitted, by the name in ``--only``."""
+"""Plants that are fitted, by their names in ``--only``."""
 
 QUESTIONS = [
     Question("disk", "free run of 5,000 samples, RMSE", root_mean_square, (0, 0), 0.0165, False),

@@ -88,7 +88,7 @@ SOURCES = {
         columns="t theta alpha plant_input saturation",
     ),
 }
-"""Where the runs of each plant come from; paths and SHA-256 sums are in ``registry.csv``."""
+"""Sources of the runs of each plant; paths and SHA-256 sums are in ``registry.csv``."""
 
 
 def tables(plant: str, folder: Path | None, *, host: str = HOST) -> dict[str, pd.DataFrame]:

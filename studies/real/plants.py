@@ -212,8 +212,8 @@ class Controller(NamedTuple):
 
 
 BALANCER = Controller((6.0, 30.0), (1.8, 2.5), 50.0, 10.0)
-"""What balanced the QUBE-Servo (``controller.toml`` of the source); it explains the recorded inputs
-to 1e-8 V where there is no test signal."""
+"""Controller that balanced the QUBE-Servo (``controller.toml`` of the source); it explains the
+recorded inputs to 1e-8 V where there is no test signal."""
 
 QUBE = Plant(
     states={"arm": "rad", "pendulum": "rad", "arm_rate": "rad/s", "pendulum_rate": "rad/s"},

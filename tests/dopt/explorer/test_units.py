@@ -112,7 +112,7 @@ CASES: dict[str, tuple[Any, ...]] = {
         {"name": "simulation_error", "growth": 1.0},
     ),
 }
-"""Whether the angle alone is measured; policy, model, learner, and limits."""
+"""True if the angle alone is measured; policy, model, learner, and limits."""
 
 
 def test_every_learner_is_among_them() -> None:

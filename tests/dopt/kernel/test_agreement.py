@@ -325,7 +325,7 @@ for mapping in json.loads(sys.argv[1]):
 print(json.dumps(found))
 """
 EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
-"""What is computed in double precision, and losses, which may be judged in single precision."""
+"""Columns computed in double precision, and losses, which may be judged in single precision."""
 
 
 def test_the_kernel_in_plain_python_gives_the_same_trials() -> None:
