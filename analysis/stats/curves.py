@@ -50,6 +50,10 @@ MOST_BOOTSTRAP_VALUES = 2000
 square. The ends differ by less than 5 % of a half-width there, of normal and of exponential values,
 where the draws of the bootstrap alone make 3 %."""
 
+FEWEST_BAND_VALUES = 6
+"""Values from which a median or interquartile mean has a band: of fewer, even their range covers
+the median of the distribution in less than 95 % (1 - 2^(1-n))."""
+
 _ROUNDING = 1e-14
 """Spread of values that differ by rounding alone, relative to the largest."""
 
@@ -72,15 +76,16 @@ class Statistic(StrEnum):
     @property
     def band(self) -> str:
         """Return the name of the interval, printed wherever it is drawn."""
-        kind = "t-interval" if self is Statistic.MEAN else "bootstrap interval"
-        return f"95 % {kind} of the {self.label}"
+        if self is Statistic.MEAN:
+            return "95 % t-interval of the mean"
+        return f"95 % bootstrap interval of the {self.label}, from {FEWEST_BAND_VALUES} trials on"
 
 
 @dataclass(frozen=True)
 class Band:
     """A centre over n trials with its interval; each of shape (T,).
 
-    With one trial there is no interval: low and high are NaN. With none, all is NaN.
+    Without an interval, as of one trial, low and high are NaN. With no trial, all is NaN.
     """
 
     centre: Array
@@ -119,11 +124,12 @@ def centre(values: Array, statistic: Statistic) -> Array:
 def band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
     """Return the centre of trials (n, T) at each step, with its 95 % interval.
 
-    Mean: ± t·SE, t the two-sided Student quantile of n - 1. Median and IQM: percentile bootstrap.
-    The draws have their own random stream, so that the band of the same trials is the same.
+    Mean: ± t·SE, t the two-sided Student quantile of n - 1. Median and IQM: percentile bootstrap,
+    from :data:`FEWEST_BAND_VALUES` trials on. The draws have their own random stream, so that the
+    band of the same trials is the same.
     """
     middle, n = centre(values, statistic), len(values)
-    if n < 2:
+    if n < (2 if statistic is Statistic.MEAN else FEWEST_BAND_VALUES):
         return _without_interval(middle, n)
     if statistic is Statistic.MEAN:
         half = student_quantile(n - 1) * standard_error(values)
