@@ -86,7 +86,10 @@ def carry_out(order: Order, output: Path) -> None:
         _start_again(order, output)
     if order.pause:
         _PAUSES[order.pause](lambda: _stop_for_ever(output.with_suffix(".paused")))
-    sys.exit(_launch(order))
+    try:
+        sys.exit(_launch(order))
+    except KeyboardInterrupt:  # also while a library is imported
+        sys.exit(ExitCode.INTERRUPTED)
 
 
 def errors_beside(output: Path) -> Path:
@@ -114,10 +117,7 @@ def _launch(order: Order) -> int:
     chosen = {"workers": 2, "chunk_seconds": 0.2, **order.settings}
     settings = LaunchSettings(order.executor, order.url, **chosen)
     request = Request((), {}, (), single=False)
-    try:
-        return start.run(request, grid_of(order.trials), settings)
-    except KeyboardInterrupt:
-        return ExitCode.INTERRUPTED
+    return start.run(request, grid_of(order.trials), settings)
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,6 @@ def _pull(order: Order, work: Work) -> int:
     settings = {"processes": 2, **dict(order.worker or {})}
     try:
         return run_worker(order.url, Output(start.say, start.say, sys.stderr), work, **settings)
-    except KeyboardInterrupt:
-        return ExitCode.INTERRUPTED
     except StoreUnavailableError as error:
         sys.stderr.write(f"{error}\n")
         return ExitCode.INFRASTRUCTURE
