@@ -35,7 +35,9 @@ from dopt.algorithm import TIE_MARGIN
 from dopt.errors import SpecificationError
 from dopt.models import MLP, Linear, Model
 from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
+from dopt.sphere import sphere_maximizer
 from dopt.systems.base import System, feature_values, next_state
+from dopt.systems.properties import STEP
 from dopt.types import Array, Scalar
 
 BatchModel = Callable[[Tensor, Tensor], Tensor]
@@ -52,7 +54,7 @@ def model_function(system: System, model: Model) -> BatchModel:
     if isinstance(model, Linear):
         return linear_function(system)
     if isinstance(model, Module):
-        return network_function(system, model.module(system))
+        return NetworkFunction(system, model.module(system))
     raise TypeError(f"model {model!r} is no network and not linear: run it in the kernel.")
 
 
@@ -99,46 +101,104 @@ def mlp_function(system: System, model: MLP) -> BatchModel:
     return accelerations
 
 
-def network_function(system: System, module: nn.Module) -> BatchModel:
-    """Return a_θ for any module that maps the features, (p,), to accelerations, (r,).
+class NetworkFunction:
+    """a_θ for any module that maps the features, (p,), to accelerations, (r,).
 
     The flat vector holds the module's parameters in the order of ``module.named_parameters()``.
     A module that gives the same for many points at once, (N, p), is called once for them.
     """
-    tied = len([*module.named_parameters(remove_duplicate=False)]) > len([*module.parameters()])
-    shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
-    lengths = [shape.numel() for shape in shapes.values()]
-    buffers = dict(module.named_buffers())
 
-    def network(theta: Tensor, phi: Tensor) -> Tensor:
-        parts = theta.split(lengths)
-        weights = {
-            name: part.view(shape)
-            for (name, shape), part in zip(shapes.items(), parts, strict=True)
-        }
-        weights |= {name: buffer.to(phi.device) for name, buffer in buffers.items()}
-        out: Tensor = functional_call(module, weights, (phi,), tie_weights=tied)
-        return out
+    def __init__(self, system: System, module: nn.Module) -> None:
+        self._system, self._module = system, module
+        every = [*module.named_parameters(remove_duplicate=False)]
+        self._tied = len(every) > len([*module.parameters()])
+        self._shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
+        self._lengths = [shape.numel() for shape in self._shapes.values()]
+        self._buffers = dict(module.named_buffers())
+        self._at_once: bool | None = None  # known once the module has been tried
+        self._one_by_one = vmap(self._network, in_dims=(None, 0))
+        self._over_trials, self._over_both = vmap(self._network), vmap(self._one_by_one)
 
-    one_by_one = vmap(network, in_dims=(None, 0))
-    over_trials, over_both = vmap(network), vmap(one_by_one)
-    at_once: list[bool] = []  # not empty once the module has been tried
-
-    def over_points(theta: Tensor, phi: Tensor) -> Tensor:
-        if not at_once:
-            at_once.append(_maps_many(network, theta, phi, one_by_one(theta, phi)))
-        return network(theta, phi) if at_once[0] else one_by_one(theta, phi)
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        phi = features(system, x).expand(len(theta), -1, -1)
-        n, points = phi.shape[:2]
+    def __call__(self, theta: Tensor, x: Tensor) -> Tensor:
+        (n, points) = len(theta), x.shape[1]
         if n > 1:
-            many = over_both(theta, phi) if points > 1 else over_trials(theta, phi[:, 0])
-            return many.view(n, points, -1)
-        one = over_points(theta[0], phi[0]) if points > 1 else network(theta[0], phi[0, 0])
+            phi = features(self._system, x).expand(n, -1, -1)
+            many = self._over_both if points > 1 else self._over_trials
+            return many(theta, phi if points > 1 else phi[:, 0]).view(n, points, -1)
+        if points > 1:
+            one = self._over_points(theta[0], features(self._system, x)[0])
+        elif x.requires_grad:
+            one = self._network(theta[0], features(self._system, x)[0, 0])
+        else:
+            one = self._network(theta[0], self._features(x[0, 0]))
         return one.view(1, points, -1)
 
-    return accelerations
+    def jacobian(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return ∂a/∂θ, (r, q), for parameters (q,) at a state (d,).
+
+        A pass backward for each row costs less than one for a batch of copies.
+        """
+        with torch.enable_grad():
+            leaves = self._leaves(theta)
+            return _rows(self._call(leaves, self._features(x)), leaves)
+
+    def gradient_and_changes(
+        self, theta: Tensor, x: Tensor, component: int, directions: Tensor
+    ) -> Tensor:
+        """Return g and its derivatives along directions (m, d), (1 + m, q), at a state (d,)."""
+        moved = [self._features(x, along) for along in directions.tolist()]
+        with torch.enable_grad():
+            leaves, phi = self._leaves(theta), self._features(x).requires_grad_()
+            chosen = self._call(leaves, phi)[component]
+            *g, slope = torch.autograd.grad(
+                chosen, (*leaves, phi), create_graph=True, materialize_grads=True
+            )
+            changes = _rows(torch.stack(moved) @ slope, leaves)
+        return torch.cat([_flat(g).detach()[None], changes])
+
+    def _features(self, x: Tensor, along: Sequence[float] | None = None) -> Tensor:
+        """Return the features of a state (d,), or their derivative along a direction, (p,)."""
+        state: list[Any] = x.tolist()
+        if along is not None:
+            state = [value + 1j * STEP * part for value, part in zip(state, along, strict=True)]
+        values = feature_values(self._system.features, self._system.feature_scales, state)
+        return x.new_tensor(values if along is None else [v.imag / STEP for v in values])
+
+    def _leaves(self, theta: Tensor) -> list[Tensor]:
+        parts = zip(theta.detach().split(self._lengths), self._shapes.values(), strict=True)
+        return [part.view(shape).requires_grad_() for part, shape in parts]
+
+    def _network(self, theta: Tensor, phi: Tensor) -> Tensor:
+        parts = zip(theta.split(self._lengths), self._shapes.values(), strict=True)
+        return self._call([part.view(shape) for part, shape in parts], phi)
+
+    def _call(self, weights: Sequence[Tensor], phi: Tensor) -> Tensor:
+        named = dict(zip(self._shapes, weights, strict=True))
+        named |= {name: buffer.to(phi.device) for name, buffer in self._buffers.items()}
+        out: Tensor = functional_call(self._module, named, (phi,), tie_weights=self._tied)
+        return out
+
+    def _over_points(self, theta: Tensor, phi: Tensor) -> Tensor:
+        if self._at_once is None:
+            expected = self._one_by_one(theta, phi)
+            self._at_once = _maps_many(self._network, theta, phi, expected)
+        return self._network(theta, phi) if self._at_once else self._one_by_one(theta, phi)
+
+
+def _rows(values: Tensor, leaves: Sequence[Tensor]) -> Tensor:
+    """Return the gradients of values, (k,), with respect to leaves of q numbers in all: (k, q)."""
+    if not values.requires_grad:  # they do not depend on them
+        return values.new_zeros(len(values), sum(map(Tensor.numel, leaves)))
+    return torch.stack(
+        [
+            _flat(torch.autograd.grad(value, leaves, retain_graph=True, materialize_grads=True))
+            for value in values
+        ]
+    )
+
+
+def _flat(parts: Sequence[Tensor]) -> Tensor:
+    return torch.cat([part.flatten() for part in parts])
 
 
 def _maps_many(network: BatchModel, theta: Tensor, phi: Tensor, expected: Tensor) -> bool:
@@ -170,13 +230,25 @@ def stack(values: Sequence[Scalar]) -> Tensor:
 
 def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
     """Return the known part of dx/dt, (..., d), for states (..., d) and inputs (..., m)."""
+    if _alone(x, u):
+        return x.new_tensor([system.known(x[0].tolist(), u[0].tolist(), system.parameters)])
     return stack(system.known(x.unbind(-1), u.unbind(-1), system.parameters))
+
+
+def _alone(*tensors: Tensor) -> bool:
+    """Return whether rows of numbers, (1, ·), belong to one trial and are not differentiated.
+
+    Numbers of Python then cost a tenth of tensors of one element.
+    """
+    return all(len(one) == 1 and one.dim() == 2 and not one.requires_grad for one in tensors)
 
 
 def true_accelerations(system: System, x: Tensor, u: Tensor, step: int) -> Tensor:
     """Return a at a step, (..., r), for states (..., d) and inputs (..., m)."""
     parameters = system.history[min(step, len(system.history) - 1)].tolist()
     point = torch.cat([x, u], dim=-1) if system.reads_inputs else x
+    if _alone(point):
+        return x.new_tensor([system.accelerations(point[0].tolist(), parameters)])
     return stack(system.accelerations(point.unbind(-1), parameters))
 
 
@@ -206,6 +278,11 @@ def model_states(
 def input_matrix(system: System, x: Tensor) -> Tensor:
     """Return B = dt ∂known/∂u, (n, d, m), at states (n, d)."""
     n, d = x.shape
+    if _alone(x):
+        steps = (1j * STEP * np.eye(system.n_inputs)).tolist()
+        rates = [system.known(x[0].tolist(), step, system.parameters) for step in steps]
+        slopes = [[complex(rate).imag / STEP for rate in of_input] for of_input in rates]
+        return system.dt * x.new_tensor([slopes]).mT
     with torch.enable_grad():
         u = x.new_zeros(n, d, system.n_inputs).requires_grad_()
         known = known_flow(system, x.unsqueeze(1).expand(-1, d, -1), u)
@@ -220,6 +297,8 @@ def input_matrix(system: System, x: Tensor) -> Tensor:
 def jacobian(model: BatchModel, r: int, theta: Tensor, x: Tensor) -> Tensor:
     """Return J = ∂a/∂θ, (n, N, r, q), of r accelerations for parameters (n, q) at (n, N, d)."""
     (n, N), q = x.shape[:2], theta.shape[1]
+    if n * N == 1 and isinstance(model, NetworkFunction):
+        return model.jacobian(theta[0], x[0, 0]).view(1, 1, r, q)
     with torch.enable_grad():
         each = theta.detach()[:, None, None].expand(n, N, r, q).reshape(-1, q).requires_grad_()
         values = model(each, x.unsqueeze(2).expand(n, N, r, -1).reshape(len(each), 1, -1))
@@ -331,7 +410,7 @@ class Module(Model):
         return _array(parameters_to_vector(drawn.parameters()))
 
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
-        function = network_function(system, self.module(system))
+        function = NetworkFunction(system, self.module(system))
         theta, states = torch.as_tensor(parameters), torch.as_tensor(points)
         with torch.no_grad():
             return _array(function(theta[None], states[None])[0])
@@ -451,6 +530,8 @@ def planning_columns(
     bar = predicted_states(system, model, theta, x)
     B = input_matrix(system, bar)
     n, m = len(x), B.shape[2]
+    if n == 1 and isinstance(model, NetworkFunction):
+        return model.gradient_and_changes(theta[0], bar[0], int(components[0]), B[0].mT)[None]
     g, DB = gradients_and_changes(
         model,
         theta.repeat_interleave(m, dim=0),
@@ -477,6 +558,9 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     if v.shape[1] == 1:
         up = (v < 0) | ((v == 0) & (ties > 0))
         chosen = torch.where(up, gamma, -gamma).to(v)
+    elif len(v) == 1:
+        of_one = [one[0].numpy(force=True) for one in (Q, v, ties)]
+        return v.new_tensor(sphere_maximizer(of_one[0], of_one[1], gamma, of_one[2]))[None]
     else:
         Q, v = torch.where(finite.unsqueeze(-1), Q, 0.0), torch.where(finite, v, 0.0)
         chosen = maximize_on_spheres(Q, v, gamma, ties)

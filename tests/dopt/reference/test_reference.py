@@ -19,9 +19,10 @@ from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.models import (
     SMALL,
     BatchInformation,
+    NetworkFunction,
     gradients_and_changes,
     jacobian,
-    network_function,
+    planning_columns,
 )
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -49,11 +50,30 @@ def test_a_network_that_does_not_use_a_parameter_has_zeros_there() -> None:
             super().__init__(3, 1, dtype=torch.float64)
             self.unused = torch.nn.Parameter(torch.ones(2, dtype=torch.float64))
 
-    function = network_function(SYSTEMS["pendulum"](), Partly())
+    function = NetworkFunction(SYSTEMS["pendulum"](), Partly())
     theta, x = torch.ones(2, 6, dtype=torch.float64), torch.ones(2, 3, 2, dtype=torch.float64)
     J = jacobian(function, 1, theta, x)
     assert torch.equal(J[..., 4:], torch.zeros_like(J[..., 4:]))
     assert bool((J[..., :4] != 0).all())
+
+
+@pytest.mark.parametrize("env", sorted(SYSTEMS))
+def test_one_trial_has_the_derivatives_of_a_batch(env: str) -> None:
+    system = SYSTEMS[env]()
+    r = system.n_learned
+    torch.manual_seed(0)
+    function = NetworkFunction(system, Stack(len(system.features), r).double())
+    q = sum(parameter.numel() for parameter in function._module.parameters())
+    theta, x = 0.5 * torch.randn(2, q).double(), torch.randn(2, system.n_states).double()
+    k = torch.tensor([r - 1, 0])
+    both = planning_columns(system, function, theta, x, k)
+    rows = jacobian(function, r, theta, x[:, None])
+    for i in range(2):
+        one = theta[i : i + 1], x[i : i + 1]
+        columns = planning_columns(system, function, *one, k[i : i + 1])
+        torch.testing.assert_close(columns[0], both[i], rtol=1e-9, atol=1e-11)
+        found = jacobian(function, r, one[0], one[1][:, None])
+        torch.testing.assert_close(found[0], rows[i], rtol=1e-9, atol=1e-12)
 
 
 class Noted(Stack):
@@ -82,7 +102,7 @@ def test_a_network_is_called_once_for_many_points_where_that_gives_the_same(
     module.called_with = []
     theta = torch.nn.utils.parameters_to_vector(module.parameters()).detach()[None]
     states = torch.tensor(rng.standard_normal((1, 7, system.n_states)))
-    function = network_function(system, module)
+    function = NetworkFunction(system, module)
     one_by_one = [function(theta, states[:, i : i + 1])[0, 0] for i in range(7)]
     for _ in range(2):  # the first time it is tried
         module.called_with.clear()
