@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -95,13 +95,15 @@ class OutcomeColumn(NamedTuple):
     """Type in SQL, unit and meaning of a column.
 
     A launch takes its value from the result of the trial or, ``of_run``, from the record of its
-    run, where the attribute has the name of the column.
+    run, where the attribute has the name of the column. ``since`` is the version of the schema
+    that added it: it stands at the end of its table then, as in an upgraded database.
     """
 
     kind: Any
     unit: str
     meaning: str
     of_run: bool = False
+    since: int = 0
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,12 @@ RUN_COLUMNS = tuple(name for name, column in OUTCOME.items() if column.of_run)
 """Columns of an outcome that an attempt has too."""
 
 metadata = MetaData()
+
+
+def _outcome(names: Iterable[str], *, added: bool = False) -> list[Column[Any]]:
+    """Return columns of the outcome that a later schema has added, or the others."""
+    chosen = sorted(names, key=lambda name: OUTCOME[name].since)
+    return [Column(name, OUTCOME[name].kind) for name in chosen if added is (OUTCOME[name].since > 0)]
 
 
 def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
@@ -217,10 +225,11 @@ trial = _table(
     Column("status", Text, nullable=False),
     Column("owner", _Long, ForeignKey("launch.launch_id")),  # launch with the claim while running
     Column("attempt", Integer, nullable=False),
-    *(Column(name, column.kind) for name, column in OUTCOME.items()),
+    *_outcome(OUTCOME),
     Column("launch_id", _Long, ForeignKey("launch.launch_id")),  # launch of the outcome
     Column("error_id", _Long, ForeignKey("error.error_id")),
     Column("registered_by", _Long),  # launch_id of the code that may run it while it is pending
+    *_outcome(OUTCOME, added=True),
     _one_of("status", STATUSES),
     UniqueConstraint("config_id", "seed"),
     Index("trial_by_owner", "owner"),
@@ -279,8 +288,9 @@ attempt = _table(
     _text("claimed"),
     _text("started", nullable=True),
     _text("ended", nullable=True),
-    *(Column(name, OUTCOME[name].kind) for name in RUN_COLUMNS if name != "node"),
+    *_outcome(name for name in RUN_COLUMNS if name != "node"),
     Column("error_id", _Long, ForeignKey("error.error_id")),
+    *_outcome(RUN_COLUMNS, added=True),
     Index("attempt_by_end", "ended"),
     rowid=False,
 )
