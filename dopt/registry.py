@@ -134,6 +134,11 @@ def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any)
     check_own_fields(cls)
     own = cast("type[T]", cls)
     missing = [key for key in dir(own) if getattr(getattr(own, key), "__isabstractmethod__", False)]
+    for base in wanted.__mro__:
+        declared = {
+            key for key, hint in inspect.get_annotations(base).items() if "ClassVar" in hint
+        }
+        missing += [key for key in sorted(declared - {"name"}) if not hasattr(own, key)]
     if missing:
         raise _unfit(section, path, f"a class that defines {', '.join(missing)}")
     name = own.__dict__.get("name")

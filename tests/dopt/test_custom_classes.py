@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import linecache
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -126,6 +127,23 @@ def test_another_state_of_the_file_is_another_trial(
     assert after.trial_key != before.trial_key
     with pytest.raises(SpecificationError, match="another state of its file"):
         TrialSpec.from_mapping(before.to_mapping())
+
+
+LEFT_OUT = "physical state_labels input_labels learned_rows features phase_plane grid_indices known"
+
+
+@pytest.mark.parametrize("left_out", LEFT_OUT.split())
+def test_a_system_that_leaves_out_a_declaration_is_told_which(
+    left_out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (EXAMPLE / "vehicle.py").read_text()
+    renamed = text.replace(f"def {left_out}(", "def other(")
+    without = re.sub(rf"(?m)^    {left_out}: ClassVar.*\n", "", renamed, count=1)
+    assert without != text
+    (tmp_path / "vehicle.py").write_text(without)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(SpecificationError, match=rf"a class that defines {left_out} is expected"):
+        specification()
 
 
 HERE = __name__
