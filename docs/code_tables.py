@@ -143,7 +143,11 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "trial_id": _TRIAL_ID,
         "attempt": ("", "number of the run, from 1"),
         "launch_id": _LAUNCH_ID,
-        "outcome": ("", "how the run ended"),
+        "outcome": (
+            "",
+            "done, diverged, failed, released (given back: its process died, or a stop)"
+            " or lost (its launch died)",
+        ),
         "cause": ("", "why it failed"),
         "node": ("", "host of the run"),
         "pid": ("", "process of the run"),

@@ -1,4 +1,4 @@
-"""Random numbers of a trial, all drawn before it starts.
+"""Random numbers of a trial, drawn before it starts; plans and updates in numpy have own streams.
 
 One seed gives named child streams, so that a draw for one purpose does not shift another. Policies
 that are compared at the same seed share initial weights and process noise (common random numbers).

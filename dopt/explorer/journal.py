@@ -1,9 +1,9 @@
 """Append-only file of an exploration: its specification, and everything that changed its state.
 
-Each line is one event as JSON. It is in the file before the exploration goes on, and a durable one
-is on the disk where ``fsync`` is set; a line that a power cut has torn is dropped when the file is
-opened again, the first one only where it is the beginning of the one that would be written. Real
-numbers are written so that they are read back bit for bit.
+Each line is one event (:mod:`dopt.explorer.state`) as JSON. It is in the file before the
+exploration goes on, and a durable one is on the disk where ``fsync`` is set; a line that a power
+cut has torn is dropped when the file is opened again, the first one only where it is the beginning
+of the one that would be written. Real numbers are written so that they are read back bit for bit.
 
 The entry ``sum`` at the end of a line is the CRC-32 of all bytes of the file before it, so that no
 line can be changed, removed, added or moved without notice. Journals of format 1 have none before

@@ -456,7 +456,8 @@ def _unknown_option(given: str, options: Iterable[str]) -> str:
     group, option = match.groups() if match else ("", given)
     if sentence := removed_word(f"{group}={option}"):
         return sentence
-    return str(unknown_name(group or "configuration", option, {*options, *option_names(group)}))
+    unknown = unknown_name(group or "configuration", option, {*options, *option_names(group)})
+    return f"{unknown} A file of another folder is found with --config-dir FOLDER."
 
 
 def _unknown_key(cause: OmegaConfBaseException) -> str:

@@ -145,7 +145,9 @@ metadata = MetaData()
 def _outcome(names: Iterable[str], *, added: bool = False) -> list[Column[Any]]:
     """Return columns of the outcome that a later schema has added, or the others."""
     chosen = sorted(names, key=lambda name: OUTCOME[name].since)
-    return [Column(name, OUTCOME[name].kind) for name in chosen if added is (OUTCOME[name].since > 0)]
+    return [
+        Column(name, OUTCOME[name].kind) for name in chosen if added is (OUTCOME[name].since > 0)
+    ]
 
 
 def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
