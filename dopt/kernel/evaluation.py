@@ -48,11 +48,10 @@ def model_error(
     stop: int,
     buffers: Buffers,
 ) -> float:
-    """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the points from ``start`` to ``stop``.
+    """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the blocks of points from ``start`` to ``stop``.
 
     Parameters ``thetas``, (E, q), of more than one network stand for the mean of what they give.
-    Except for the linear model, points come in blocks, and both bounds lie between blocks or at the
-    end.
+    For the linear model both bounds count points (:attr:`Evaluation.bounds`).
     """
     theta = thetas[0]
     if network.kind == ModelKind.LINEAR:

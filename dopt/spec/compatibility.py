@@ -119,7 +119,8 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     _check_inputs(system, policy, model, learner)
     if not _teaches(type(learner), type(model)):
         taught = [name for name, one in MODELS.items() if _teaches(type(learner), one)]
-        teachers = [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
+        offered = [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
+        teachers = [name for name in offered if _learns_in(LEARNERS[name], system)]
         expected = f"{_choice('model', taught)} and {given} with {_choice('learner', teachers)}"
         raise mismatch(f"learner '{learner.name}'", expected, "the two together", "were")
     fits = not isinstance(learner, GaussNewton) or learner.refit_every == 1
@@ -204,6 +205,13 @@ def _check_sensors(system: System, learner: Learner) -> None:
             f"measured one ({names})"
         )
         raise mismatch("a choice of measured states", expected, f"learner '{learner.name}'")
+
+
+def _learns_in(learner: type[Learner], system: System) -> bool:
+    """Return True if a learner runs on a system with what is measured there."""
+    if issubclass(learner, SimulationError):
+        return isinstance(system, ExploredPlant)
+    return bool(system.n_measured) or not learner.estimates_states
 
 
 def _teaches(learner: type[Learner], model: type[Model]) -> bool:

@@ -177,7 +177,8 @@ def test_any_numbers_come_back(
         (
             {"path": None, "learner": {"name": "recursive_least_squares"}},
             "^learner 'recursive_least_squares' goes with model 'linear', 'linear_state' or 'rff' "
-            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf', 'gauss_newt",
+            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf' or "
+            "'gauss_newton', but",
         ),
     ],
 )
