@@ -261,34 +261,11 @@ TABLES = {
         "/home/ada/results/results.db",
         ("/home", "nfs4"),
     ),
-    "scratch on Lustre, home on local disks": (
-        "24 1 253:0 / / rw,relatime shared:1 - xfs /dev/mapper/rl-root rw,attr2,inode64\n"
-        "97 24 253:2 / /home rw,relatime shared:52 - xfs /dev/mapper/rl-home rw,attr2,inode64\n"
-        "139 24 0:57 / /lustre/scratch rw,relatime shared:70 - lustre 10.1.0.1@o2ib:/scratch rw\n",
-        "/lustre/scratch/ada/results.db",
-        ("/lustre/scratch", "lustre"),
-    ),
-    "GPFS": (
-        ROOT + "188 29 0:61 / /gpfs/fs1 rw,relatime shared:88 - gpfs fs1 rw,maxblocksize=16384k\n",
-        "/gpfs/fs1/group/results.db",
-        ("/gpfs/fs1", "gpfs"),
-    ),
     "a share of Windows with a space in its name": (
         ROOT + r"301 29 0:71 / /mnt/lab\040data rw,relatime shared:150 - cifs //filer/lab rw,"
         "vers=3.1.1,cache=strict,username=ada\n",
         "/mnt/lab data/results.db",
         ("/mnt/lab data", "cifs"),
-    ),
-    "BeeGFS": (
-        ROOT + "150 29 0:55 / /mnt/beegfs rw,relatime - beegfs beegfs_nodev rw,cfgFile=/etc/b\n",
-        "/mnt/beegfs/results.db",
-        ("/mnt/beegfs", "beegfs"),
-    ),
-    "a folder of another machine by ssh": (
-        ROOT + "55 29 0:24 / /sys/fs/fuse/connections rw - fusectl fusectl rw\n"
-        "420 29 0:60 / /home/ada/remote rw,nosuid,nodev - fuse.sshfs ada@hpc: rw,user_id=1000\n",
-        "/home/ada/remote/runs/results.db",
-        ("/home/ada/remote", "fuse.sshfs"),
     ),
     "a local disk mounted below a home on NFS": (
         ROOT + "412 29 0:52 / /home rw - nfs nas:/export/home rw,vers=3,nolock\n"
@@ -317,6 +294,7 @@ TABLES = {
 LOCAL = {"ext4", "xfs", "btrfs", "zfs", "overlay", "tmpfs", "fuseblk", "fuse.mergerfs", "ntfs3"}
 SHARED = {
     *("nfs", "nfs4", "cifs", "smb3", "9p", "ceph", "fuse.sshfs", "fuse.glusterfs"),
+    *("lustre", "gpfs", "beegfs"),
     *("virtiofs", "vboxsf", "prl_fs", "drvfs", "fakeowner"),  # a virtual machine and its host
     *("vmhgfs", "fuse.vmhgfs-fuse", "fuse.grpcfuse", "fuse.osxfs", "fuse", "lxfs", "unheard_of"),
 }
@@ -329,20 +307,15 @@ def test_a_table_is_judged(name: str) -> None:
     assert is_network(kind) == (kind not in LOCAL)
 
 
-@pytest.mark.parametrize("kind", sorted(LOCAL))
-def test_what_disks_of_this_machine_hold_is_no_network(kind: str) -> None:
-    assert not is_network(kind)
-
-
-@pytest.mark.parametrize("kind", sorted(SHARED))
+@pytest.mark.parametrize("kind", sorted(SHARED | LOCAL))
 def test_what_is_not_known_to_be_safe_is_refused_unless_the_user_says_that_it_is(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert is_network(kind)
+    assert is_network(kind) == (kind in SHARED)
     monkeypatch.setenv("DOPT_SAFE_FILE_SYSTEMS", f"other, {kind}")
     assert not is_network(kind)
     monkeypatch.setenv("DOPT_SAFE_FILE_SYSTEMS", f"{kind}x")
-    assert is_network(kind)
+    assert is_network(kind) == (kind in SHARED)
 
 
 def test_a_database_on_a_network_is_refused_before_anything_is_written(
