@@ -22,6 +22,7 @@ from tests.orchestrate.store.databases import file_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
 
 SPECS = [Spec(seed) for seed in range(4)]
+Change = Callable[[Path, Path], object]
 DONE = "SELECT seed FROM v_trial WHERE status = 'done' ORDER BY seed"
 
 
@@ -54,10 +55,6 @@ def deleted(folder: Path, _: Path) -> None:
         path.unlink() if path.is_file() else None
 
 
-def deleted_alone(folder: Path, _: Path) -> None:
-    (folder / "real" / "file.db").unlink()
-
-
 def renamed(folder: Path, _: Path) -> None:
     (folder / "real" / "file.db").rename(folder / "moved.db")
 
@@ -72,34 +69,17 @@ def retargeted(folder: Path, other: Path) -> None:
     (folder / "results.db").symlink_to(other)
 
 
-def without_link(folder: Path, _: Path) -> None:
-    (folder / "results.db").unlink()
-
-
-def folder_renamed(folder: Path, _: Path) -> None:
-    (folder / "real").rename(folder / "elsewhere")
-
-
-def without_log(folder: Path, _: Path) -> None:
-    (folder / "real" / "file.db-wal").unlink()
-
-
-def without_shared_memory(folder: Path, _: Path) -> None:
-    (folder / "real" / "file.db-shm").unlink()
-
-
-CHANGES = (
-    deleted,
-    deleted_alone,
-    renamed,
-    replaced,
-    retargeted,
-    without_link,
-    folder_renamed,
-    without_log,
-    without_shared_memory,
-)
-Change = Callable[[Path, Path], None]
+CHANGES: dict[str, Change] = {
+    "deleted": deleted,
+    "deleted alone": lambda folder, _: (folder / "real" / "file.db").unlink(),
+    "renamed": renamed,
+    "replaced": replaced,
+    "retargeted": retargeted,
+    "without its link": lambda folder, _: (folder / "results.db").unlink(),
+    "folder renamed": lambda folder, _: (folder / "real").rename(folder / "elsewhere"),
+    "without its log": lambda folder, _: (folder / "real" / "file.db-wal").unlink(),
+    "without shared memory": lambda folder, _: (folder / "real" / "file.db-shm").unlink(),
+}
 
 
 def content(folder: Path) -> dict[Path, bytes]:
@@ -117,14 +97,14 @@ def done(path: Path) -> list[int]:
         return [row.seed for row in reader.rows(DONE)]
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", CHANGES)
 def test_what_it_holds_is_saved_and_nothing_else_is_written(
-    change: Change, url: str, folder: Path, other: Path
+    name: str, url: str, folder: Path, other: Path
 ) -> None:
     with Store.open(url) as store:
         _, claims = begin(store, *SPECS)
         assert store.commit(claims[0], result(0), RUN)
-        change(folder, other)
+        CHANGES[name](folder, other)
         before, others = content(folder), other.read_bytes()
         with pytest.raises(DatabaseMovedError, match="since it was opened") as caught:
             store.commit(claims[1], result(1), RUN)
@@ -138,12 +118,12 @@ def test_what_it_holds_is_saved_and_nothing_else_is_written(
     assert other.read_bytes() == others
     new = {path for path in {*content(folder)} - {*before} if ".saved-" not in path.name}
     assert not {path for path in new if path.suffix == ".db"}
-    if change is replaced:
+    if name == "replaced":
         assert (folder / "real" / "file.db").read_bytes() == others
         assert done(folder / "results.db") == []
     assert store.safe_url in str(caught.value)
     assert "\n" not in str(caught.value)
-    if change is renamed:
+    if name == "renamed":
         assert f"is now {folder / 'moved.db'}" in str(caught.value)
         with closing(sqlite3.connect(folder / "moved.db")) as moved:
             assert moved.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
