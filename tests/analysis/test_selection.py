@@ -56,39 +56,37 @@ def choice(*counted: tuple[ConfigRow, int]) -> list[ConfigRow]:
 
 WIDE = {"model": {"width": 64}}
 NARROW = {"model": {"width": 8}}
+GAMMA = {"env": {"gamma": 3.0}}
+FAR = {"policy": {"lookahead": 20}}
+ASSESSED = {"task": {"name": "control", "checkpoints": [100]}}
 
 
-def test_the_setting_with_most_trials_of_the_reference_decides_for_all_policies() -> None:
-    usual, wide = config("pendulum", "d_optimal"), config("pendulum", "d_optimal", **WIDE)
-    random, more = config("pendulum", "random"), config("pendulum", "random", **WIDE)
-    chosen = choice((wide, 20), (usual, 100), (random, 10), (more, 50))
-    assert {entry.config_key for entry in chosen} == {usual.config_key, random.config_key}
-
-
-def test_another_world_is_never_mixed_in() -> None:
-    usual = config("pendulum", "d_optimal")
-    oracle = config("pendulum", "oracle", env={"gamma": 3.0})
-    assert choice((usual, 5), (oracle, 9)) == [usual]
-
-
-def test_without_the_reference_the_commonest_setting_is_taken() -> None:
-    few, many = config("pendulum", "random", **WIDE), config("pendulum", "random")
-    assert choice((few, 3), (many, 4)) == [many]
+@pytest.mark.parametrize(
+    ("counted", "chosen"),
+    [
+        # The setting with most trials of the reference decides for all policies.
+        ([("d_optimal", WIDE, 20), ("d_optimal", {}, 100), ("random", {}, 10),
+          ("random", WIDE, 50)], [1, 2]),
+        ([("d_optimal", {}, 5), ("oracle", GAMMA, 9)], [0]),  # another world is never mixed in
+        ([("random", WIDE, 3), ("random", {}, 4)], [1]),  # without the reference the commonest
+        # More trials of the baselines settle a tie of the reference.
+        ([("d_optimal", WIDE, 20), ("d_optimal", NARROW, 20), ("random", NARROW, 20)], [1, 2]),
+        # A task is no departure, but the last to decide.
+        ([("lookahead", FAR, 5), ("lookahead", ASSESSED, 5)], [1]),
+        ([("lookahead", ASSESSED, 5), ("lookahead", {}, 5), ("lookahead", FAR, 5)], [1]),
+    ],
+)  # fmt: skip
+def test_one_setting_is_chosen(
+    counted: list[tuple[str, dict[str, dict[str, object]], int]], chosen: list[int]
+) -> None:
+    given = [(config("pendulum", policy, **more), n) for policy, more, n in counted]
+    assert choice(*given) == [given[i][0] for i in chosen]
 
 
 def test_a_tie_names_the_difference_and_the_way_out() -> None:
     wide, narrow = (config("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
     with pytest.raises(AnalysisError, match=r"20 trials each.*model\.width.*--where model\.width="):
         choice((wide, 20), (narrow, 20))
-
-
-def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
-    task = {"task": {"name": "control", "checkpoints": [100]}}
-    plain = config("pendulum", "lookahead")
-    assessed = config("pendulum", "lookahead", **task)
-    far = config("pendulum", "lookahead", policy={"lookahead": 20})
-    assert choice((far, 5), (assessed, 5)) == [assessed]
-    assert choice((assessed, 5), (plain, 5), (far, 5)) == [plain]
 
 
 def test_between_learners_with_equal_trials_the_usual_one_decides() -> None:
@@ -119,13 +117,6 @@ def test_the_advice_on_a_tie_names_what_all_of_them_have() -> None:
     path, values = difference([filters[0].config, config("pendulum", "d_optimal").config])
     assert (path, values) == ("learner.name", ["ekf", "adam_window"])
     assert difference([filters[0].config] * 2)[0] == "config_key"
-
-
-def test_more_trials_of_the_baselines_settle_a_tie_of_the_reference() -> None:
-    wide, narrow = (config("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
-    random = config("pendulum", "random", **NARROW)
-    chosen = choice((wide, 20), (narrow, 20), (random, 20))
-    assert chosen == [narrow, random]
 
 
 def test_filter_by_value() -> None:
