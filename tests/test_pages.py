@@ -169,20 +169,14 @@ def test_every_query_answers_and_mixes_no_configurations(small: str) -> None:
             assert len(set(steps)) == len(steps), question
 
 
-def test_every_column_of_the_schema_is_described() -> None:
+def test_every_column_table_and_view_is_described_and_queries_are_counted() -> None:
     described = re.findall(r"^\| `(\w+)` \| `(\w+)` \|", PAGES[DATABASE], flags=re.MULTILINE)
     own = [table for table in metadata.tables.values() if table.name not in INNER]
     stored = [(table.name, column.name) for table in own for column in table.columns]
     assert sorted(described) == sorted(stored)
-
-
-def test_the_page_counts_its_queries() -> None:
     numbers = {"Six": 6, "Seven": 7, "Eight": 8, "Nine": 9}
     (said,) = re.findall(r"^## (\w+) useful queries$", PAGES[DATABASE], flags=re.MULTILINE)
     assert numbers[said] == len(QUERIES)
-
-
-def test_every_table_and_view_is_described() -> None:
     page = PAGES[DATABASE]
     for name in (*metadata.tables, *VIEWS):
         assert f"`{name}`" in page or name == "alembic_version", name

@@ -47,14 +47,11 @@ def test_curves_are_tidy_and_exact(results: analysis.Results) -> None:
     np.testing.assert_allclose(chosen.time, chosen.dt * chosen.t)
 
 
-def test_every_width_is_there_and_told_apart(results: analysis.Results) -> None:
+def test_every_width_is_told_apart_and_trials_have_one_row_each(results: analysis.Results) -> None:
     curves = results.curves("loss")
     dopt = curves[(curves.env == "cartpole") & (curves.policy == "d_optimal")]
     assert sorted(dopt.width.unique()) == [4, 8, 16, 32, 64]
     assert (dopt.groupby("width").size() == 5 * 60).all()
-
-
-def test_trials_have_one_row_each(results: analysis.Results) -> None:
     trials = results.trials()
     assert trials.trial_key.is_unique
     assert (trials.status == "diverged").sum() == 1
@@ -67,11 +64,18 @@ def test_a_request_narrows(url: str) -> None:
         assert results.matrix("cartpole", "d_optimal").values.shape == (5, 60)
 
 
-def test_a_matrix_equals_the_figures(results: analysis.Results) -> None:
+def test_a_matrix_equals_the_figures_and_trajectories_are_stacked(
+    results: analysis.Results,
+) -> None:
     matrix = results.matrix("cartpole", "random")
     assert matrix.seeds.tolist() == list(range(5))
     assert matrix.diverged.tolist() == [False, False, True, False, False]
     assert np.isnan(matrix.values[2, 20:]).all()
+    paths = results.trajectories("cartpole", "random")
+    assert paths.states.shape == (5, 61, 4)
+    assert paths.inputs.shape == (5, 60, 1)
+    assert len(paths.t) == 61
+    assert np.isnan(paths.states[2, 21:]).all()
 
 
 def test_one_configuration_of_each_policy_is_shown(results: analysis.Results) -> None:
@@ -81,14 +85,6 @@ def test_one_configuration_of_each_policy_is_shown(results: analysis.Results) ->
     dopt = shown[(shown.env == "cartpole") & (shown.policy == "d_optimal")]
     assert dopt.width.tolist() == [16]
     assert set(shown.index) < set(results.configurations().index)
-
-
-def test_trajectories_are_stacked(results: analysis.Results) -> None:
-    paths = results.trajectories("cartpole", "random")
-    assert paths.states.shape == (5, 61, 4)
-    assert paths.inputs.shape == (5, 60, 1)
-    assert len(paths.t) == 61
-    assert np.isnan(paths.states[2, 21:]).all()
 
 
 def test_what_is_not_there_is_a_sentence(results: analysis.Results, url: str) -> None:

@@ -174,13 +174,10 @@ def test_geometric_mean_by_hand() -> None:
     assert mean_over_steps(np.array([[0.0, 1.0]])).tolist() == [0.0]
 
 
-def test_first_passage_by_hand() -> None:
+def test_first_and_last_passage_by_hand() -> None:
+    """The last is the first step of the last stretch below, so that a dip does not count."""
     curves = np.array([[5.0, 2, 3, 1], [5.0, 4, 4, 4], [1.0, 9, 9, 9], [5.0, 4, 3, 2]])
     assert first_passage(curves, 2.0).tolist() == [2, INF, 1, 4]
-
-
-def test_last_passage_by_hand() -> None:
-    """It is the first step of the last stretch below, so that a dip does not count."""
     curves = np.array([[5.0, 2, 3, 1], [5.0, 1, 4, 4], [1.0, 2, 1, 2], [5.0, 4, 3, 2]])
     assert last_passage(curves, 2.0).tolist() == [4, INF, 1, 4]
     assert last_passage(np.array([[1.0, math.nan], [math.nan, 1.0]]), 2.0).tolist() == [INF, 2]
@@ -395,14 +392,11 @@ def test_a_choice_is_on_the_front_exactly_if_no_other_dominates_it(
 def test_a_front_by_hand() -> None:
     costs = np.array([[1, 9], [2, 5], [2, 6], [3, 5], [4, 1], [np.nan, 0], [4, 1]])
     assert on_front(costs).tolist() == [True, True, False, False, True, False, True]
-
-
-def test_nothing_has_no_front_and_no_geometric_mean() -> None:
     assert not len(on_front(np.empty((0, 2))))
-    assert np.isnan(geometric_mean(np.empty(0)).value)
 
 
 def test_the_interval_comes_from_the_logarithms() -> None:
+    assert np.isnan(geometric_mean(np.empty(0)).value)
     found = geometric_mean(np.array([1.0, 10.0, 100.0]))
     half = 4.302652729911275 / np.sqrt(3)  # t quantile of 2 degrees of freedom
     assert found.value == pytest.approx(10.0)
