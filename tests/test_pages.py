@@ -73,7 +73,8 @@ def test_a_changed_number_is_noticed_and_written(
     """On a copy of the README, beside the files."""
     shutil.copy(ROOT / "README.md", tmp_path)
     copied = tmp_path / "docs"
-    shutil.copytree(ROOT / "docs", copied, ignore=shutil.ignore_patterns("vendor", "*.png", "*.gif"))
+    pictures = shutil.ignore_patterns("vendor", "*.png", "*.gif")
+    shutil.copytree(ROOT / "docs", copied, ignore=pictures)
     made, summary = tables(copied), copied / "summary.csv"
     made.PAGES = ("../README.md",)  # type: ignore[attr-defined]
     first = summary.read_text().splitlines()[1].split(",")[3]
