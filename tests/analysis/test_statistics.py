@@ -66,11 +66,34 @@ def test_one_trial_has_a_mean_and_no_interval_and_none_gives_nan_without_a_warni
     assert np.isnan(standard_error(np.array([1.0])))
 
 
+@pytest.mark.parametrize("n", [4, 20])
+def test_the_interval_covers_the_mean_of_normal_trials_as_often_as_it_says(n: int) -> None:
+    repeats = 20_000  # every column is an experiment
+    values = np.random.default_rng(n).normal(loc=3.0, scale=2.0, size=(n, repeats))
+    band = band_of(values)
+    covered = np.mean((band.low <= 3.0) & (band.high >= 3.0))
+    assert covered == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / repeats))
+
+
 def test_centres_by_hand() -> None:
     values = np.array([[0.0], [1.0], [2.0], [3.0], [4.0], [5.0], [6.0], [700.0]])
     assert centre(values, Statistic.MEDIAN)[0] == 3.5
     assert centre(values, Statistic.IQM)[0] == (2 + 3 + 4 + 5) / 4  # two of eight off each end
     assert centre(values, Statistic.MEAN)[0] == pytest.approx(721 / 8)
+
+
+@pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
+def test_the_bootstrap_draws_whole_trials_and_the_same_ones_each_time(
+    statistic: Statistic,
+) -> None:
+    trials = np.random.default_rng(1).normal(size=(15, 1))
+    curves = np.hstack([trials, trials, 2 * trials])  # a step repeated, and one scaled
+    first, again = band_of(curves, statistic), band_of(curves, statistic)
+    np.testing.assert_array_equal(first.low, again.low)
+    assert first.low[0] == first.low[1]
+    assert first.low[2] == pytest.approx(2 * first.low[0])
+    assert (first.low <= first.centre).all()
+    assert (first.centre <= first.high).all()
 
 
 @pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
