@@ -35,6 +35,14 @@ def without_coverage() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE")}
 
 
+def ran(*words: object, folder: Path = ROOT, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with some words, such as ``-m orchestrate``; it may fail."""
+    return subprocess.run(
+        [sys.executable, *map(str, words)], cwd=folder, env=os.environ | variables,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
 def printed(program: str, *words: str, folder: Path = ROOT, **variables: str) -> str:
     """Return what a text prints as a program in a process of its own, which may not fail."""
     return _printed([program, *words], folder, os.environ | variables)

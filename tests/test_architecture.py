@@ -173,11 +173,8 @@ def test_what_is_compiled_is_made_of_sources_that_name_its_cache() -> None:
             assert all(name.startswith((*folders, annotations)) for name in own), path
 
 
-def test_nothing_imports_the_analysis_but_itself() -> None:
+def test_nothing_imports_a_study_or_the_analysis_but_itself() -> None:
     assert all(path.startswith("analysis/") for path in importers("analysis"))
-
-
-def test_nothing_imports_a_study() -> None:
     assert not importers("studies")
 
 
@@ -233,14 +230,11 @@ def test_numbers_load_neither_matplotlib_nor_what_runs_trials() -> None:
     assert not tops_loaded_by(f"import {', '.join(modules)}") & heavy
 
 
-def test_a_specification_loads_numpy_and_nothing_heavier() -> None:
+def test_a_specification_loads_numpy_alone_and_the_store_five_modules_of_the_science() -> None:
     always = tops_loaded_by("")  # such as Debian's sitecustomize
     modules = ", ".join(module_name(path) for path in sources("dopt/spec"))
     third_party = tops_loaded_by(f"import {modules}") - always - set(sys.stdlib_module_names)
     assert {name for name in third_party if not name.startswith("_")} <= {"dopt", "numpy"}
-
-
-def test_the_store_loads_at_most_five_modules_of_the_science() -> None:
     names = loaded_by("import orchestrate.store")
     assert len([name for name in names if name.split(".")[0] == "dopt"]) <= 5
 

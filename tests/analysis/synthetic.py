@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from dopt.assessment import violations
 from dopt.errors import IncompatibleError
+from dopt.evaluation import simulate
 from dopt.models import MLP
 from dopt.result import Assessment, TrialResult
 from dopt.run import run_trial
@@ -89,8 +90,7 @@ def fake_results(specs: Sequence[TrialSpec], diverged: Mapping[str, int]) -> lis
     states: dict[int, Array] = {}
     for system, group in members.items():
         together = np.stack([inputs[i] for i in group], axis=1)
-        paths = _simulate(system, together, [specs[i].seed for i in group])
-        states.update(zip(group, np.moveaxis(paths, 1, 0), strict=True))
+        states.update(zip(group, np.moveaxis(simulate(system, together), 1, 0), strict=True))
     return [
         _result(spec, inputs[i], states[i], draws[i], diverged.get(spec.trial_key))
         for i, spec in enumerate(specs)
@@ -102,11 +102,7 @@ def _entropy(spec: TrialSpec) -> list[int]:
 
 
 def _result(
-    spec: TrialSpec,
-    inputs: Array,
-    states: Array,
-    rng: np.random.Generator,
-    diverged_at: int | None,
+    spec: TrialSpec, inputs: Array, states: Array, rng: np.random.Generator, diverged_at: int | None
 ) -> TrialResult:
     system, policy = spec.system, spec.policy.name
     loss = _losses(system.horizon, RATES.get(policy, 2.0), rng)
@@ -169,22 +165,6 @@ def _inputs(system: System, policy: str, rng: np.random.Generator) -> Array:
         wave = np.sign(wave + rng.normal(size=T))
     inputs: Array = system.gamma * wave[:, None] * mode.direction
     return inputs
-
-
-def _simulate(system: System, inputs: Array, seeds: Sequence[int]) -> Array:
-    """Return the states, (T + 1, n, d), under inputs, (T, n, m), and each seed's noise."""
-    states = np.empty((system.horizon + 1, len(seeds), system.n_states))
-    states[0] = system.initial_state
-    shape = (system.horizon, system.n_states)
-    drawn = [np.random.default_rng(seed).normal(size=shape) for seed in seeds]
-    noise = np.sqrt(system.dt) * system.noise * np.stack(drawn, axis=1)
-    rows = list(system.learned_rows)
-    for t, u in enumerate(inputs):
-        known = system.known(tuple(states[t].T), tuple(u.T), system.parameters)
-        flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-        flow[:, rows] += system.learned(states[t])
-        states[t + 1] = states[t] + system.dt * flow + noise[t]
-    return states
 
 
 def _losses(horizon: int, rate: float, rng: np.random.Generator) -> Array:

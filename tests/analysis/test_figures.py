@@ -57,13 +57,6 @@ def test_the_table_says_which_systems_a_row_is_of(
     assert "needs trials of the reference d_optimal" in capsys.readouterr().err
 
 
-def test_other_widths_leave_the_selection_of_the_other_figures_alone(reader: Reader) -> None:
-    selection = select(reader, Filter())
-    assert selection.gaps == ()
-    assert {entry.config.width for entry in selection.of("cartpole")} == {16, None}
-    assert len(selection.of("cartpole")) == 5
-
-
 @pytest.mark.parametrize("seeds", [3, 5, 9])
 def test_however_many_trials_another_width_has(tmp_path: Path, seeds: int) -> None:
     grid = make_grid(("cartpole",), ("d_optimal", "random", "oracle"), range(5), **SHORT)

@@ -329,13 +329,10 @@ def test_a_file_that_is_no_log_is_answered_by_a_sentence(
     assert "expected" in str(raised.value) or "convert it" in str(raised.value)
 
 
-def test_what_a_file_holds_is_said_if_it_is_no_table(tmp_path: Path) -> None:
+def test_what_a_file_holds_is_said_if_it_is_no_table_or_more(tmp_path: Path) -> None:
     savemat(tmp_path / "mixed.mat", {"a": np.zeros(5), "b": np.zeros(7), "c": np.zeros(9)})
     with pytest.raises(AnalysisError, match=r"holds a \(5,\), b \(7,\), c \(9,\)"):
         read_table(tmp_path / "mixed.mat")
-
-
-def test_variables_of_another_length_are_said(tmp_path: Path) -> None:
     savemat(tmp_path / "run.mat", {**frame().to_dict("list"), "edges": np.zeros(7)})
     assert analysis.read_log(tmp_path / "run.mat").notes[0].endswith("left out: edges (7).")
 

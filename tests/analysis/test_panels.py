@@ -166,10 +166,14 @@ def test_policies_of_the_user_have_their_own_colours() -> None:
         assert contrast_to_white(colour) >= 3
 
 
-def test_dotted_letters_become_mathematics() -> None:
+def test_labels_and_small_ticks_become_mathematics() -> None:
     assert mathematical("φ̇ [rad/s]") == r"$\dot{\varphi}$ [rad/s]"
     assert mathematical("ẏ [m/s]") == r"$\dot{y}$ [m/s]"
     assert mathematical("x [m]") == "x [m]"
+    assert log_text(0.03) == "0.03"
+    assert log_text(3e-4) == r"$3\times10^{-4}$"
+    assert log_text(1e-3) == r"$10^{-3}$"
+    assert log_text(1.5e-3) == r"$1.5\times10^{-3}$"
 
 
 @pytest.mark.parametrize(
@@ -192,13 +196,6 @@ def test_a_logarithmic_axis_has_labels_and_no_crowd(decades: float, fewest: int)
         texts = axes.yaxis.get_major_formatter().format_ticks(places)
         shown = {text for place, text in zip(places, texts, strict=True) if low <= place <= high}
         assert fewest <= len(shown) <= 8
-
-
-def test_small_ticks_are_powers_of_ten() -> None:
-    assert log_text(0.03) == "0.03"
-    assert log_text(3e-4) == r"$3\times10^{-4}$"
-    assert log_text(1e-3) == r"$10^{-3}$"
-    assert log_text(1.5e-3) == r"$1.5\times10^{-3}$"
 
 
 def test_log_limits_ignore_what_a_logarithm_cannot_show() -> None:
@@ -234,6 +231,9 @@ def test_median_seed() -> None:
 
 
 def test_every_system_rests_inside_its_box() -> None:
+    plane = Plane.of(SYSTEMS["cartpole"]())
+    assert plane.box[0] == pytest.approx((0, 2 * math.pi)), "centred on hanging"
+    assert plane.angles == (True, False)
     for name, kind in SYSTEMS.items():
         system = kind()
         plane = Plane.of(system)
@@ -242,12 +242,6 @@ def test_every_system_rests_inside_its_box() -> None:
         (left, right), (bottom, top) = plane.box
         assert left < x < right, name
         assert bottom < y < top, name
-
-
-def test_the_cartpole_is_centred_on_hanging() -> None:
-    plane = Plane.of(SYSTEMS["cartpole"]())
-    assert plane.box[0] == pytest.approx((0, 2 * math.pi))
-    assert plane.angles == (True, False)
 
 
 def test_panels_share_the_seed_and_the_start(reader: Reader) -> None:

@@ -98,10 +98,7 @@ def test_trials_without_stored_states_are_named(
 
 
 def test_what_is_stored_is_in_tables_report_and_browser_and_is_not_fitted_again(
-    url: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     summary = ("summary", "--db", url, "--format", "csv")
     assert "sample_loss" not in run(capsys, *summary)[0]

@@ -28,12 +28,7 @@ from analysis.stats.curves import (
     tabulate_curves,
     wrapped_line,
 )
-from analysis.stats.scores import (
-    Measure,
-    relative_costs,
-    scores_at,
-    true_model,
-)
+from analysis.stats.scores import Measure, relative_costs, scores_at, true_model
 from analysis.style import number, p_text, percent_text, plus_minus
 from analysis.tables.comparisons import compare_policies, summarise
 from analysis.tables.rendering import comparison_table, summary_table

@@ -85,16 +85,11 @@ def test_every_question_is_a_function_that_says_what_it_measures(question: str) 
     assert getattr(module, question).__doc__.startswith("Return ")
 
 
-def test_ratios_are_above_one_where_the_target_is_met() -> None:
-    at_most, at_least = Target(1, 125.0), Target(4, 300_000.0, at_least=True)
-    assert at_most.ratio(100.0) == 1.25
-    assert at_least.ratio(150_000.0) == 0.5
-    assert at_most.ratio(0.0) == math.inf
-
-
 def test_a_row_shows_how_many_times_faster_it_is_than_others_or_why_it_was_left_out() -> None:
     row = Row("step", 100.0, "µs", Target(1, 125.0), Anchor(12_600.0, "others"), "note")
     assert row.cells() == ["100 µs", "1: ≤ 125", "1.25", "12,600", "126", "note"]
+    assert Target(4, 300_000.0, at_least=True).ratio(150_000.0) == 0.5
+    assert Target(1, 125.0).ratio(0.0) == math.inf
     first, *_, last = Row("scan", None, note="jax is not installed").cells()
     assert (first, last) == ("left out", "jax is not installed")
 
@@ -128,6 +123,8 @@ def past(tmp_path: Path) -> Path:
 
 def test_a_history_is_read_as_it_was_written(tmp_path: Path) -> None:
     runs = [run(100.0), run(3.0, unit="rows/s")]
+    runs[0].add("width", [Row("share", 5.0, "%"), Row("scan", None, note="no jax")], 0.01)
+    assert list(runs[0].rows) == ["step: D-optimal"], "what is no time is left out"
     for each in runs:
         append(tmp_path / "new" / "history.jsonl", each)
     assert read(tmp_path / "new" / "history.jsonl") == runs
@@ -173,12 +170,6 @@ def test_a_run_is_compared_with_those_on_its_kind_of_processor(past: Path) -> No
     assert not slower(runs, run(200.0, processor="other"))
     assert slower(runs, run(210.0, processor="other"))
     assert slower(runs, run(121.0))
-
-
-def test_what_is_no_time_is_left_out() -> None:
-    made = run(1.0)
-    made.add("width", [Row("share", 5.0, "%"), Row("scan", None, note="no jax")], 0.01)
-    assert list(made.rows) == ["step: D-optimal"]
 
 
 def test_the_command_fails_where_a_row_became_slower(
@@ -286,13 +277,10 @@ def database(path: Path, key: str = "a", loss: float = 0.1, states: bytes = b"1"
     return str(path)
 
 
-def test_equal_numbers_are_equal_whatever_the_times(tmp_path: Path) -> None:
-    assert bit_equality.main([database(tmp_path / "old.db"), database(tmp_path / "new.db")]) == 0
-
-
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
+        ({}, ""),  # whatever the times
         ({"loss": 0.1 + 2**-55}, "differs in table step"),
         ({"states": b"2"}, "differs in table trajectory"),
         ({"key": "b"}, "old.db alone"),
@@ -305,12 +293,9 @@ def test_a_difference_is_named(
     line: str,
 ) -> None:
     old, new = database(tmp_path / "old.db"), database(tmp_path / "new.db", **changed)  # type: ignore[arg-type]
-    assert bit_equality.main([old, new]) == 1
+    assert bit_equality.main([old, new]) == bool(changed)
     assert line in capsys.readouterr().out
-
-
-def test_two_databases_are_expected(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bit_equality.main(["nowhere.db"]) == 2
+    assert bit_equality.main([old]) == 2
     assert "two SQLite databases are expected" in capsys.readouterr().out
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -181,13 +180,6 @@ class OldReset(PointEnv):
         return super().reset()[0]
 
 
-class OldResetTwo(PointEnv):
-    """Returns two numbers, which could be an observation with an info."""
-
-    def reset(self, **given: Any) -> Any:
-        return super().reset(**given)[0]
-
-
 class FourValues(PointEnv):
     def step(self, action: Any) -> Any:
         observation, reward, terminated, _, info = super().step(action)
@@ -229,15 +221,9 @@ class Seedless(PointEnv):
 class Shaken(PointEnv):
     """Has noise of a generator that its seed does not reach."""
 
-    draw: Callable[[], float] = staticmethod(lambda: float(np.random.standard_normal()))  # noqa: NPY002
-
     def step(self, action: Any) -> Any:
-        self.speed = self.speed + 0.01 * type(self).draw()
+        self.speed = self.speed + 0.01 * np.random.standard_normal()  # noqa: NPY002
         return super().step(action)
-
-
-class ShakenByPython(Shaken):
-    draw = staticmethod(lambda: random.gauss(0.0, 1.0))
 
 
 class Writing(PointEnv):
@@ -266,8 +252,7 @@ class OneBuffer(PointEnv):
         return self.buffer, *rest
 
 
-for kind in (OldReset, OldResetTwo, FourValues, NotFinite, Failing, Tau, Seedless, Shaken,
-             ShakenByPython, Writing):  # fmt: skip
+for kind in (OldReset, FourValues, NotFinite, Failing, Tau, Seedless, Shaken, Writing):
     register(kind, wall=1e9)
 for kind in (Whole, Truncating, Restarting, OneSided, OneBuffer):
     register(kind)

@@ -232,17 +232,6 @@ def test_the_reachable_set_has_states_that_the_square_wave_visits(name: str) -> 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_simulated_step_is_the_euler_map(name: str) -> None:
-    system = dataclasses.replace(SYSTEMS[name](), horizon=5)
-    inputs = np.random.default_rng(0).standard_normal((5, 3, system.n_inputs))
-    path = simulate(system, inputs)
-    for t in range(5):
-        for i in range(3):
-            step = system.dt * system.derivative(path[t, i], inputs[t, i], t)
-            assert path[t + 1, i] == pytest.approx(path[t, i] + step, rel=1e-13, abs=1e-15)
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_the_truth_at_the_points_is_that_of_the_system(name: str) -> None:
     system = SYSTEMS[name]()
     points = evaluation_set(system)

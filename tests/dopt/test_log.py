@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,7 @@ import pytest
 import dopt
 from dopt.errors import SpecificationError
 from dopt.log import Log
-from tests.paths import ROOT
+from tests.paths import loaded_by
 
 N = 200
 T = np.arange(N) * 0.01
@@ -338,16 +335,12 @@ def test_a_fault_is_answered_by_a_sentence(
 
 def test_a_log_needs_numpy_alone_and_no_unix() -> None:
     program = (
-        "import json, sys\n"
+        "import sys\n"
         "for name in ('fcntl', 'resource', 'pwd'): sys.modules[name] = None\n"
         "import dopt\n"
         "log = dopt.Log({'t': [0, 1, 2], 'a': [1, 2, 3], 'u': [0, 0, 1]}, states=['a'], "
         "inputs=['u'])\n"
         "assert log.n_rows == 3\n"
-        "print(json.dumps([one for one in sys.modules if sys.modules[one]]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    loaded = {name.partition(".")[0] for name in json.loads(done.stdout)}
+    loaded = {name.partition(".")[0] for name in loaded_by(program)}
     assert not loaded & {"pandas", "scipy", "numba", "torch", "sqlalchemy", "matplotlib"}

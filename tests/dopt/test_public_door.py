@@ -222,14 +222,11 @@ def test_a_quota_counts_in_whole_cores(
     assert process.usable_cores() == expected
 
 
-def test_the_smallest_quota_up_the_hierarchy_counts(group: Group) -> None:
+def test_the_smallest_quota_counts_up_to_the_top_that_a_container_sees(group: Group) -> None:
     quotas = {"a/cpu.max": "300000 100000", "a/b/cpu.max": "max 100000", "a/b/c/cpu.max": "5 1"}
     group("cgroup2", "0::/a/b/c\n", quotas)
     assert process.usable_cores() == 3
-
-
-def test_a_container_sees_its_own_group_as_the_top(group: Group) -> None:
-    """What is mounted begins at it, while its path is that on the host."""
+    # In a container what is mounted begins at its own group, while its path is that on the host.
     files = {"cpu.cfs_quota_us": "250000", "cpu.cfs_period_us": "100000"}
     group("cgroup", "4:cpu,cpuacct:/docker/1f\n", files, root="/docker/1f")
     assert process.usable_cores() == 2

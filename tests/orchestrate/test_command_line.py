@@ -30,7 +30,7 @@ from orchestrate.store.backend import parse_url
 from orchestrate.store.sqlite import existing_path
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.pages import commands
-from tests.paths import ROOT
+from tests.paths import ROOT, ran
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -62,7 +62,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["seed=-1"], "seed is -1"),
         (["seed=99999999999999999999"], "seed is 9+, but a whole number .* below 2\\^63"),
         (["env.horizon=99999999999"], "env.horizon is 9+ steps, .* be from 1 to 2147483647: set"),
-        (["-m", "seed=range(0,1e12)"], "has more than 1,000,000 values"),
         (
             ["policy=random", "policy.regularization=1"],
             "'regularization' is unknown, no setting of policy exists",
@@ -81,7 +80,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
             for device in ("cuda:99", "banana", "meta")
         ),
         (["plant=real", "plant.delay=-1"], "plant.delay is -1.0 samples"),
-        (["plant=real", "plant.counts=0"], "plant.counts is 0.0"),
         (["plant.delay=1"], "setting of plant 'delay' is unknown without .*: add plant=real"),
         (["+limits.bounds={y:[-1,1]}"], "'bounds' is unknown without .*: add limits=box or lim"),
         (["-m", "seed=0", "++task.steps=3"], "'steps' is unknown without .*: add task=control"),
@@ -99,12 +97,9 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["store.url=sqlite:////dev/null/results.db"], "cannot be made or opened"),
         (["store.url=sqlite://results/x.db"], "names a host, .* sqlite:///results/x.db"),
         (["store.url=sqlite:///$HOME/r.db"], "database URL is '\\$HOME/r.db', but \\$HOME is expa"),
-        (["store.url=sqlite:///~nobody-here/r.db"], "is '~nobody-here/r.db', but a path is expec"),
         (["store.url=sqlite:///a\nb.db"], "holds the control character '\\\\n'"),
-        (["store.url=postgresql://you:secret@host/a\tb"], "holds the control character '\\\\t'"),
         (["store.url=sqlite:///r.db?mode=ro"], "has a \\?, behind which SQLite takes no options"),
         (["store.url=sqlite:///r\udcff.db"], "bytes that are no text in UTF-8"),
-        (["store.url=sqlite:////dev"], "/dev is a folder, but a file is expected"),
         (["--cfg", "jobs"], "--cfg 'jobs' is unknown.* did you mean 'job'"),
         (["--bogus"], "option '--bogus' is unknown"),
         (["--mutlirun", "seed=1,2"], "did you mean '--multirun'"),
@@ -125,12 +120,9 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "~launch.timeout"], "an override deletes 'timeout', which a launch needs"),
         (["pendulum"], "'pendulum' is not an override: write key=value"),
         (["seed=abc"], "seed is 'abc', but a whole number"),
-        (["seed=1.5"], "seed is 1.5, but a whole number"),
-        (["seed=null"], "seed is null, but a whole number"),
         (["env.horizon=null"], "env.horizon is null, but a whole number is expected"),
         (["+evn=arm"], "setting 'evn' is unknown.* did you mean 'env'"),
         (["++widht=8"], "setting 'widht' is unknown.* did you mean 'width'"),
-        (["-m", "+widht=8,16"], "setting 'widht' is unknown.* did you mean 'width'"),
         (["+env.foo=1"], "field 'foo' is unknown"),
         (["+launch.worker=1"], "setting of launch 'worker' is unknown.* did you mean 'workers'"),
         (["+launch.ray.adress=x"], "setting of launch.ray 'adress' is unknown"),
@@ -143,20 +135,13 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "policy=d_optimal,random", "policy.frm=dual"], "did you mean 'form'"),
         (["-m", "task=none,control", "task.stps=9"], "setting of task 'stps' .*mean 'steps'"),
         (["policy=random_held"], "did you mean 'baseline/random_held'"),
-        (["policy=lookahead"], "did you mean 'beyond/lookahead'"),
         (["policy=beyond/exatc"], "policy 'beyond/exatc' is .* did you mean 'beyond/exact'"),
         (["-m", "policy=beyond/lookahaed,random"], "did you mean 'beyond/lookahead'"),
-        (["policy=beyond/random_held"], "did you mean 'baseline/random_held'"),
-        (["policy=max"], "did you mean 'beyond/max'"),
         (["env=chain"], "env 'chain' is unknown.* did you mean 'beyond/chain'"),
         (["hydra/launcher=basci"], "hydra/launcher 'basci' is .* did you mean 'basic'"),
         (["policy=beyond/exact", "policy.form=dual"], "setting of policy 'form' is unknown"),
-        (["policy=beyond/lookahead", "policy.stride=99"], "policy.stride is 99 steps, but"),
         (["-m", "hydra/sweeper=basic", "seed=1,2"], "hydra/sweeper is set, but"),
         (["width=1000000"], "would need .* GiB of memory, .* make model.width smaller"),
-        (["env.grid_points=[1000000,1000000]"], "make env.grid_points smaller"),
-        (["env=beyond/chain", "env.grid_points=[1000]"], "a power of two .* set it to 512 or 1024"),
-        (["policy=random", "env.horizon=1000000000"], "env.horizon is 1,000,000,000 steps, but"),
         (["-m", "width=8,99999", "launch.memory_gib=1"], "but launch.memory_gib allows 1 GiB"),
     ],
 )
@@ -191,32 +176,27 @@ def test_a_trial_prints_its_result_and_is_stored(command_line: Command, tmp_path
 
 
 def test_a_grid_runs_once_and_the_default_is_a_hundred_seeds(command_line: Command) -> None:
-    grid = ("-m", "env=glob(*)", "policy=random,periodic", *LOCAL)
+    grid = ("-m", "env=arm,quadrotor", "policy=random,periodic", *LOCAL)
     code, output, _ = command_line(*grid)
     assert code == 0, output
     assert "left out 100 trials: env=quadrotor policy=periodic" in output
-    assert "0 of 700 already done, 700 to run" in output
-    assert "700 of 700 done, 0 failed" in output
-    assert "700 of 700 already done, nothing to run" in command_line(*grid)[1]
+    assert "0 of 300 already done, 300 to run" in output
+    assert "300 of 300 done, 0 failed" in output
+    assert "300 of 300 already done, nothing to run" in command_line(*grid)[1]
 
 
 def test_every_policy_runs_behind_real_hardware(command_line: Command, tmp_path: Path) -> None:
-    policies = "glob(*),glob(baseline/*),beyond/exact,beyond/gradient,beyond/max,beyond/episodic"
+    policies = "policy=glob([*,baseline/*,beyond/exact,beyond/gradient,beyond/max,beyond/episodic])"
     small = ("plant=ideal,real", "plant.delay=0,1.5", "plant.supply=1", "env.grid_points=[2,2]")
-    for policy in policies.split(","):
-        code, output, errors = command_line(
-            *("-m", "env=pendulum", f"policy={policy}", *small, "seed=0"),
-            *("env.horizon=50", "executor=inprocess"),
-        )
-        assert code == 0, errors + output
-        assert re.search("\\b0 failed.*\\b0 diverged", output)
+    words = ("-m", "env=pendulum", policies, *small, "seed=0", "env.horizon=50")
+    code, output, errors = command_line(*words, "executor=inprocess")
+    assert code == 0, errors + output
+    assert re.search("\\b0 failed.*\\b0 diverged", output)
     with sqlite3.connect(tmp_path / "results/results.db") as connection:
         sql = "SELECT group_concat(label, ';') FROM config WHERE policy = 'd_optimal'"
         [labels] = connection.execute(sql).fetchone()
     grid = "D-optimal, grid_points=[2, 2], horizon 50"
-    assert set(labels.split(";")) == {
-        *(grid, f"{grid}, supply=1", f"{grid}, delay=1.5, supply=1"),
-    }
+    assert set(labels.split(";")) == {*(grid, f"{grid}, supply=1", f"{grid}, delay=1.5, supply=1")}
 
 
 def test_a_failed_trial_says_how_to_run_it_again(
@@ -278,9 +258,7 @@ def test_flags_may_stand_anywhere(command_line: Command) -> None:
     assert (code, output.splitlines()[-1]) == (0, "2 trials, 0 done, 2 to run")
 
 
-def test_one_trial_of_an_experiment_is_one_whose_sweeps_are_all_decided(
-    command_line: Command,
-) -> None:
+def test_an_experiment_whose_sweeps_are_all_decided_is_one_trial(command_line: Command) -> None:
     decided = ("experiment=smoke", "env=arm", "policy=random", "seed=0")
     code, output, errors = command_line(*decided, "launch.dry_run=true")
     assert (code, errors) == (0, "")
@@ -307,18 +285,12 @@ def test_help_and_configuration(command_line: Command) -> None:
     assert code == 0
     assert "python orchestrate/launch.py" in output
     assert "env: arm, cartpole, pendulum, quadrotor" in output
-    code, output, _ = command_line("--cfg", "job", "width=8")
-    assert code == 0
-    assert "width: 8" in output
 
 
 def test_it_runs_from_any_folder_without_being_installed(tmp_path: Path) -> None:
     """The real thing, once: no output folders, no change of folder, the plugin found."""
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "orchestrate/launch.py"), "-m", "env=glob(*)", "seed=0",
-         "launch.dry_run=true"],
-        cwd=tmp_path, capture_output=True, text=True,
-    )  # fmt: skip
+    grid = ("-m", "env=glob(*)", "seed=0", "launch.dry_run=true")
+    done = ran(ROOT / "orchestrate/launch.py", *grid, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert "4 trials, 0 done, 4 to run" in done.stdout
@@ -369,14 +341,15 @@ def test_a_single_trial_that_is_interrupted_before_its_start_says_so(
 def test_a_dry_run_shows_the_grid_and_makes_no_database(
     command_line: Command, tmp_path: Path
 ) -> None:
-    grid = ("-m", "policy=random", "width=8,16", "seed=range(4)", *SHORT)
+    grid = ("-m", "policy=random,oracle", "width=8,16", "seed=range(4)", *SHORT)
     code, output, _ = command_line(*grid, "launch.dry_run=true")
     assert code == 0
     assert list(tmp_path.iterdir()) == []
     assert re.search(r"pendulum +random, .*width 8 +4 +0 +0 +4\n", output)
-    assert "8 trials, 0 done, 8 to run" in output
+    assert len(re.findall("oracle", output)) == 1, "a model without width runs once"
+    assert "12 trials, 0 done, 12 to run" in output
     command_line(*grid, "seed=range(3)")
-    assert "8 trials, 6 done, 2 to run" in command_line(*grid, "launch.dry_run=true")[1]
+    assert "12 trials, 9 done, 3 to run" in command_line(*grid, "launch.dry_run=true")[1]
 
 
 def test_a_dry_run_counts_trials_that_run_again(
@@ -402,17 +375,6 @@ def test_a_dry_run_tells_its_configs_apart(command_line: Command) -> None:
     assert re.search(r"arm +random, dt=0.01 +1", output)
     assert re.search(r"pendulum +random, .*mass=3 +1", output)
     assert "6 trials" in output
-
-
-def test_width_reaches_the_model_and_a_model_without_width_runs_once(
-    command_line: Command,
-) -> None:
-    _, output, _ = command_line(
-        "-m", "policy=random,oracle", "width=4,8", "seed=0", "launch.dry_run=true"
-    )
-    assert re.search(r"random, width 4 .* 1\n", output)
-    assert re.search(r"random, width 8 .* 1\n", output)
-    assert len(re.findall("oracle", output)) == 1
 
 
 SHOWN = {word for command in commands("launch.py") for word in command.words}
@@ -478,14 +440,6 @@ def test_options(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 FROM_VARIABLE = "The database URL in the environment variable DOPT_DB cannot be read"
 
 
-def test_the_database_of_the_environment(
-    command_line: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/mine.db")
-    assert command_line(*SHORT)[0] == 0
-    assert (tmp_path / "mine.db").exists()
-
-
 def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
     command_line: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -501,6 +455,9 @@ def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
     assert "error: The database URL cannot be read: write it as" in command_line(*SHORT)[2]
     _, _, errors = command_line(*SHORT, "store.url=mine/x.db")
     assert "The database URL cannot be read: write it as sqlite:///mine/x.db." in errors
+    monkeypatch.setenv("DOPT_DB", "sqlite:///${HOME}/r.db")
+    said = "in the environment variable DOPT_DB is '${HOME}/r.db', but ${HOME} is expand"
+    assert said in command_line(*SHORT)[2]
 
 
 def test_an_empty_variable_counts_as_unset(
@@ -546,30 +503,23 @@ NO_DATABASE = (
 )
 
 
-@pytest.mark.parametrize("name", [one.name for one in COMMANDS if one.needs_database])
+PROGRAMS = [
+    *((orchestrate, command.name) for command in COMMANDS if command.needs_database),
+    *((analysis, name) for name in ANALYSES),
+]
+
+
+@pytest.mark.parametrize(("program", "name"), PROGRAMS)
 def test_a_file_of_something_else_is_refused_by_every_command(
-    name: str, notes: Path, capsys: pytest.CaptureFixture[str]
+    program: Callable[[list[str]], int], name: str, notes: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = notes.read_bytes()
-    code = orchestrate([name, *ARGUMENTS.get(name, []), "--db", "sqlite:///notes.toml"])
+    before, words = notes.read_bytes(), [name, *ARGUMENTS.get(name, [])]
+    code = program([*words, "--db", "sqlite:///notes.toml"])
     assert (code, *capsys.readouterr()) == (2, "", NO_DATABASE.format("notes.toml"))
+    if name == "merge":
+        code = program(["merge", "notes.toml", "--db", "sqlite:///other.db"])
+        assert (code, *capsys.readouterr()) == (2, "", NO_DATABASE.format(notes))
     assert notes.read_bytes() == before
-
-
-def test_a_merge_refuses_a_file_of_something_else(
-    notes: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert orchestrate(["merge", "notes.toml", "--db", "sqlite:///other.db"]) == 2
-    assert capsys.readouterr() == ("", NO_DATABASE.format(notes))
-
-
-@pytest.mark.usefixtures("notes")
-@pytest.mark.parametrize("name", ANALYSES)
-def test_a_file_of_something_else_is_refused_by_the_analysis(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code = analysis([name, *ARGUMENTS.get(name, []), "--db", "sqlite:///notes.toml"])
-    assert (code, *capsys.readouterr()) == (2, "", NO_DATABASE.format("notes.toml"))
 
 
 @pytest.mark.usefixtures("notes")
@@ -626,17 +576,6 @@ def test_a_database_of_any_name(command_line: Command, tmp_path: Path, name: str
     assert orchestrate(["merge", "--db", "sqlite:///merged.db", str(tmp_path)]) == 0
 
 
-@pytest.mark.usefixtures("home")
-def test_a_variable_in_the_address_makes_no_folder(
-    command_line: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DOPT_DB", "sqlite:///${HOME}/r.db")
-    code, output, errors = command_line(*TRIAL)
-    assert (code, output) == (2, "")
-    assert "in the environment variable DOPT_DB is '${HOME}/r.db', but ${HOME} is expand" in errors
-    assert [path.name for path in Path.cwd().iterdir()] == ["home"]
-
-
 def test_a_password_may_hold_what_a_path_may_not() -> None:
     url = parse_url("postgresql://me:$HOME%7E~%0A@host/dopt\n")
     assert (url.password, url.database) == ("$HOME~~\n", "dopt")
@@ -659,34 +598,19 @@ def test_no_option_takes_a_path_unread() -> None:
     assert sum("given_path" in repr(one.type) for one in actions) >= 6
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["backup", "$X/r.db"], ["export", "curves", "--out", "$X/c.csv"], ["merge", "$X/other.db"]],
-)
-def test_options_of_the_commands(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert orchestrate(words) == 2
-    assert "'$X/" in capsys.readouterr().err
-
-
-def test_options_of_the_analysis(capsys: pytest.CaptureFixture[str]) -> None:
+def test_paths_of_options_are_read(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ("backup $X/r.db", "export curves --out $X/c.csv", "merge $X/other.db"):
+        assert orchestrate(words.split()) == 2
+        assert "'$X/" in capsys.readouterr().err
     assert analysis(["figures", "--out", "$X/f"]) == 2
     assert "--out is '$X/f', but $X is expanded by a shell" in capsys.readouterr().err
 
 
 def test_the_cache_of_the_kernel(tmp_path: Path, home: Path) -> None:
-    def run(folder: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, str(ROOT / "orchestrate/launch.py"), *TRIAL, "launch.dry_run=true"],
-            env={**os.environ, "DOPT_CACHE": folder},
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-
-    refused = run("$HOME/cache")
+    words = (ROOT / "orchestrate/launch.py", *TRIAL, "launch.dry_run=true")
+    refused = ran(*words, folder=tmp_path, DOPT_CACHE="$HOME/cache")
     assert refused.returncode == 2
     assert refused.stderr.startswith("error: DOPT_CACHE is '$HOME/cache', but $HOME is expanded")
-    assert run("~/cache\n").returncode == 0
+    assert ran(*words, folder=tmp_path, DOPT_CACHE="~/cache\n").returncode == 0
     assert [path.name for path in home.iterdir()] == ["cache"]
     assert [path.name for path in tmp_path.iterdir()] == ["home"]

@@ -21,7 +21,7 @@ from orchestrate.runner.start import Work
 from orchestrate.store import Reader
 from orchestrate.store.maintenance import examine
 from tests.orchestrate.faults.laboratory import flaws
-from tests.paths import ROOT
+from tests.paths import ROOT, ran
 from tests.waiting import PATIENCE_SECONDS, until
 
 
@@ -62,13 +62,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.xdist_group("real trials")  # one run in one process for all of them
 def test_every_executor_stores_the_same_numbers(executor: str, alone: str, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / executor}.db"
-    done = subprocess.run(
-        [sys.executable, "orchestrate/launch.py", *words(executor, url)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = ran("orchestrate/launch.py", *words(executor, url))
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(numbers(alone)) == 6 * 12 + 2 * (2 + 4 * 3)
     assert numbers(url) == numbers(alone)

@@ -24,7 +24,8 @@ from dopt import Explorer
 from orchestrate.store import LaunchRecord, Reader, Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import make_grid
-from tests.dopt.explorer.plants import MOTOR, following
+from tests.dopt.explorer.plants import MOTOR, drive
+from tests.orchestrate.store.databases import execute
 
 
 def test_the_grid_has_the_means_of_the_summary(client: TestClient, reader: Reader) -> None:
@@ -57,10 +58,7 @@ def test_curves_equal_figure_1(client: TestClient, reader: Reader, column: str) 
     asked = f"env=cartpole&column={column}&x=seconds"
     found = client.get(f"/api/curves?{asked}").json()
     expected = measure_curves(
-        reader,
-        select(reader, Filter(("cartpole",))),
-        column,
-        PlotOptions(Axis.SECONDS),
+        reader, select(reader, Filter(("cartpole",))), column, PlotOptions(Axis.SECONDS)
     )
     assert [curve["policy"] for curve in found["curves"]] == [one.policy for one in expected]
     for curve, one in zip(found["curves"], expected, strict=True):
@@ -249,22 +247,24 @@ def test_a_database_may_come_later_and_be_made_again(tmp_path: Path, visit: Visi
     assert client.get("/api/grid").json()["progress"]["total"] == 6
 
 
-def test_an_old_schema_is_one_sentence(tmp_path: Path, visit: Visit) -> None:
-    import sqlite3
-
-    with sqlite3.connect(tmp_path / "results.db") as connection:
-        connection.execute("CREATE TABLE something (number INTEGER)")
-    connection.close()
-    answer = visit(f"sqlite:///{tmp_path}/results.db").get("/")
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("CREATE TABLE something (number INTEGER)", "is not a results database of this program"),
+        (b"no database at all" * 500, "not a SQLite database"),
+    ],
+)
+def test_a_file_of_something_else_is_one_sentence(
+    content: str | bytes, sentence: str, tmp_path: Path, visit: Visit
+) -> None:
+    path = tmp_path / "results.db"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        execute(f"sqlite:///{path}", content)
+    answer = visit(f"sqlite:///{path}").get("/")
     assert answer.status_code == 503
-    assert "is not a results database of this program" in answer.text
-
-
-def test_a_damaged_file_is_one_sentence(tmp_path: Path, visit: Visit) -> None:
-    (tmp_path / "results.db").write_bytes(b"no database at all" * 500)
-    answer = visit(f"sqlite:///{tmp_path}/results.db").get("/")
-    assert answer.status_code == 503
-    assert "not a SQLite database" in answer.text
+    assert sentence in answer.text
 
 
 @pytest.mark.parametrize("way", ["retry", "commit"])
@@ -351,27 +351,17 @@ def test_a_wrong_request_is_one_sentence(client: TestClient, asked: str, sentenc
     assert client.get(f"/trials?{asked}").status_code == 400
 
 
-def explore(explorer: Explorer, steps: int) -> None:
-    x = explorer.states[-1] if explorer.n_steps else np.zeros(2)
-    for _ in range(steps):
-        x = following(x, explorer.ask(x))
-        explorer.tell(x)
-
-
 def test_its_page_follows_it(browser: Browser, sqlite_url: str) -> None:
     with Explorer(MOTOR, policy="random", steps=500) as explorer:
-        explore(explorer, 60)
+        drive(explorer, 60)
         explorer.save(sqlite_url)
         with Reader.open(sqlite_url) as reader:
             [(key,)] = reader.query("SELECT trial_key FROM trial")
-        with (
-            chromium.served(sqlite_url) as address,
-            chromium.strict_page(browser, address) as page,
-        ):
+        with chromium.served(sqlite_url) as address, chromium.strict_page(browser, address) as page:
             page.goto(f"{address}/trials/{key}")
             page.wait_for_selector("#charts[data-drawn]")
             assert "running, 60 of 500 steps" in page.inner_text("#trial-state")
-            explore(explorer, 60)
+            drive(explorer, 60)
             explorer.save(sqlite_url)
             page.wait_for_selector("text=running, 120 of 500 steps")
             page.wait_for_selector("#charts[data-drawn='120']")
@@ -381,13 +371,10 @@ def test_its_page_follows_it(browser: Browser, sqlite_url: str) -> None:
 
 def test_its_curve_is_a_running_median_among_points(browser: Browser, sqlite_url: str) -> None:
     with Explorer(MOTOR, policy="random", steps=500) as explorer:
-        explore(explorer, 40)
+        drive(explorer, 40)
         explorer.save(sqlite_url)
         errors = explorer.errors
-    with (
-        chromium.served(sqlite_url) as address,
-        chromium.strict_page(browser, address) as page,
-    ):
+    with chromium.served(sqlite_url) as address, chromium.strict_page(browser, address) as page:
         [curve] = page.request.get(f"{address}/api/curves?env=plant").json()["curves"]
         np.testing.assert_allclose(curve["points"], errors)
         assert curve["values"][20] == np.median(errors[8:33])

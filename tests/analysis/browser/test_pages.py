@@ -21,10 +21,7 @@ from tests.waiting import PATIENCE_SECONDS
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text()
-PATHS = (
-    *("/", "/curves", "/trials"),
-    "/sql?q=SELECT env, seed FROM v_trial",
-)
+PATHS = (*("/", "/curves", "/trials"), "/sql?q=SELECT env, seed FROM v_trial")
 TRIALS = ("/trials?status=failed", "/trials?env=cartpole&status=diverged")
 WIDE = """[...document.querySelectorAll('main .card:not(.scroll)')]
   .filter((box) => box.scrollWidth > box.clientWidth).map((box) => box.innerText.slice(0, 60))"""
@@ -213,10 +210,7 @@ def check_phone(page: Page, path: str) -> None:
 def test_pages_follow_a_launch(browser: Browser, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
     grids.nothing(url)
-    with (
-        chromium.commanded(url) as address,
-        chromium.strict_page(browser, address) as page,
-    ):
+    with chromium.commanded(url) as address, chromium.strict_page(browser, address) as page:
         page.goto("/")
         expect(page.locator("#grid")).to_contain_text("has no trials yet")
         gate = Gate(tmp_path)

@@ -28,10 +28,7 @@ from tests.waiting import until
 DT = MOTOR.dt
 SMALL = {"name": "mlp", "depth": 1, "width": 6}
 PLANT = dataclasses.replace(
-    MOTOR,
-    constants={"gain": unknown(8.0)},
-    delay=unknown(0.0, spread=0.02),
-    lag=unknown(0.02),
+    MOTOR, constants={"gain": unknown(8.0)}, delay=unknown(0.0, spread=0.02), lag=unknown(0.02)
 )
 
 

@@ -179,12 +179,10 @@ def test_powers_of_two_change_no_bit(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_other_units_change_hardly_anything(case: str) -> None:
-    expected = learned(case, Units(), 400)
-    for units in (Units(10.0), Units(0.1, 1000.0)):
-        found = learned(case, units, 400)
-        costs = (np.cumsum(one.errors[:100] ** 2) for one in (found, expected))
-        np.testing.assert_allclose(*costs, rtol=1e-6, err_msg=str(units))
-        assert found.free_run_error == pytest.approx(expected.free_run_error, rel=0.05), units
+    found, expected = (learned(case, units, 400) for units in (Units(0.1, 1000.0), Units()))
+    costs = (np.cumsum(one.errors[:100] ** 2) for one in (found, expected))
+    np.testing.assert_allclose(*costs, rtol=1e-6)
+    assert found.free_run_error == pytest.approx(expected.free_run_error, rel=0.05)
 
 
 def sized(**changed: Any) -> Plant:

@@ -34,7 +34,7 @@ from dopt.policies import POLICIES
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt import trials
-from tests.paths import ROOT, loaded, printed
+from tests.paths import ROOT, loaded, printed, ran
 from tests.waiting import PATIENCE_SECONDS
 
 MODULE = "A, B = 1.0, 2.0\n\ndef triple(x, out):\n    out[0] = (A + B) * x\n"
@@ -320,14 +320,7 @@ def test_a_disabled_compiler_is_refused(monkeypatch: pytest.MonkeyPatch, value: 
 
 def test_a_compiler_that_a_file_disables_is_refused(tmp_path: Path) -> None:
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\n")
-    done = subprocess.run(
-        [sys.executable, "-c", "import dopt.kernel.compiler"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = ran("-c", "import dopt.kernel.compiler", folder=tmp_path, PYTHONPATH=str(ROOT))
     last = done.stderr.splitlines()[-1]
     assert last.startswith("dopt.errors.UnusableEnvironmentError: NUMBA_DISABLE_JIT is 1")
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +11,7 @@ from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, Motion
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Identifiability, Unknowns, count_null, relative_errors
+from tests.paths import ROOT, printed
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
 
@@ -457,9 +455,8 @@ try:
 except SpecificationError as error:
     print(error)
 """
-    command = [sys.executable, "-c", text, tmp_path / "arm.xml"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "a robot needs MuJoCo, which is not installed: pip install" in done.stdout
+    said = printed(text, str(tmp_path / "arm.xml"))
+    assert "a robot needs MuJoCo, which is not installed: pip install" in said
 
 
 def test_meshes_that_are_not_there_are_said(tmp_path: Path) -> None:
@@ -477,16 +474,7 @@ def test_a_file_that_the_engine_warns_of_writes_nothing(tmp_path: Path) -> None:
     text = ARM.replace('angle="radian"', 'angle="radian" settotalmass="7"')
     (tmp_path / "arm.xml").write_text(text)
     code = "from dopt.robots import Body; print(*Body.load('arm.xml').joints)"
-    path = {"PYTHONPATH": str(Path(__file__).parents[3])}
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env=os.environ | path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "turn slide lift roll\n"
+    assert printed(code, folder=tmp_path, PYTHONPATH=str(ROOT)) == "turn slide lift roll\n"
     assert [one.name for one in tmp_path.iterdir()] == ["arm.xml"]
 
 

@@ -17,21 +17,8 @@ import pytest
 
 from orchestrate.commands import export as tables
 from orchestrate.store import Claim, Store
-from tests.orchestrate.commands.conftest import (
-    BAD,
-    DONE,
-    SECRET,
-    Answer,
-    on_both,
-    run_now,
-)
-from tests.orchestrate.store.fakes import (
-    HORIZON,
-    Spec,
-    assessed,
-    diverged,
-    result,
-)
+from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, on_both, run_now
+from tests.orchestrate.store.fakes import HORIZON, Spec, assessed, diverged, result
 from tests.paths import ROOT, without_coverage
 
 Run = Callable[..., Answer]
@@ -244,12 +231,3 @@ class TestWords:
         out = tmp_path / "curves.csv"
         assert command("export", "curves", str(out)).code == 0
         assert out.exists()
-
-
-def test_an_empty_database_has_nothing_to_export(
-    store: Store, command: Run, tmp_path: Path
-) -> None:
-    assert store.safe_url
-    answer = command("export", "trials", str(tmp_path / "out.csv"))
-    assert answer.code == 2
-    assert "holds no trials yet" in answer.err

@@ -143,6 +143,7 @@ def ended(grid: int, store: Store) -> int:
 
 
 @on_both
+@pytest.mark.usefixtures("grid")
 class TestBackup:
     def test_while_a_launch_writes(
         self, grid: int, command: Run, store: Store, url: str, tmp_path: Path
@@ -157,7 +158,7 @@ class TestBackup:
         assert [path.name for path in copy.parent.iterdir()] == ["copy"]
 
     def test_a_full_disk_names_the_copy_and_not_the_database(
-        self, grid: int, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         if url.startswith("sqlite"):
             monkeypatch.setattr("orchestrate.store.backend.sqlite3.connect", short)
@@ -170,18 +171,16 @@ class TestBackup:
             monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
         copy = tmp_path / "new" / "copy"
         answer = command("backup", str(copy))
-        assert grid
         assert answer.code == 2
         assert f"error: {copy} cannot be written (" in answer.err
         assert "No space left on device" in answer.err
         assert "results database" not in answer.err
         assert list(copy.parent.iterdir()) == []
 
-    def test_no_file_is_replaced(self, grid: int, command: Run, tmp_path: Path) -> None:
+    def test_no_file_is_replaced(self, command: Run, tmp_path: Path) -> None:
         copy = tmp_path / "copy"
         copy.write_text("mine")
         answer = command("backup", str(copy))
-        assert grid
         assert answer.code == 2
         assert "exists, a new one is expected" in answer.err
         assert copy.read_text() == "mine"
@@ -196,22 +195,32 @@ def test_without_the_program_of_the_server(
         back_up(postgresql_url, tmp_path / "copy")
 
 
+@pytest.mark.usefixtures("grid")
+def test_what_a_running_launch_has_stays(command: Run, store: Store, url: str) -> None:
+    """The deletion itself looks which launches live, as one may have begun since."""
+    before = everything(url)
+    for how in ("--dry-run", "--yes"):
+        answer = command("prune", "--env", "pendulum", how)
+        assert answer.out.startswith("There is no trial to delete. 6 more stay")
+    assert store.prune([one.trial_key for one in (*DONE, RUNNING, *WAITING)]) == 0
+    assert everything(url) == before
+
+
+@pytest.mark.usefixtures("ended")
 class TestPrune:
-    def test_a_dry_run_changes_nothing(self, ended: int, command: Run, url: str) -> None:
+    def test_a_dry_run_changes_nothing(self, command: Run, url: str) -> None:
         before = everything(url)
         answer = command("prune", "--policy", "random", "--dry-run")
-        assert ended
         assert answer.code == 0
         assert answer.out.startswith("3 trials would be deleted (3 done): 21 steps, about ")
         assert "3 more stay" in answer.out
         assert everything(url) == before
 
     @on_both
-    def test_by_query(self, ended: int, command: Run, url: str) -> None:
+    def test_by_query(self, command: Run, url: str) -> None:
         before = counts(url)
         sql = "SELECT trial_key FROM v_trial WHERE status IN ('diverged', 'failed')"
         document = command("prune", sql, "--yes", "--json").document
-        assert ended
         assert (document["deleted"], document["steps"]) == (3, 7)
         assert document["statuses"] == {"diverged": 1, "failed": 2}
         assert counts(url) == {
@@ -224,40 +233,21 @@ class TestPrune:
             "error": 0,
         }
 
-    def test_by_age(self, ended: int, store: Store, command: Run, url: str) -> None:
+    def test_by_age(self, store: Store, command: Run, url: str) -> None:
         moment = utc_text(datetime.now(UTC) - timedelta(days=100))
         launch, (claim,) = begin(store, Spec(99))
         store.commit(claim, result(99), RUN)
         execute(url, f"UPDATE attempt SET ended = '{moment}' WHERE trial_id = {claim.trial_id}")
         store.end_launch(launch, "done")
         document = command("prune", "--older-than", "90d", "--yes", "--json").document
-        assert ended
         assert document["keys"] == [Spec(99).trial_key]
         assert {key for (key,) in execute(url, "SELECT trial_key FROM trial")} == {
             one.trial_key for one in (*DONE, BAD, RUNNING, *WAITING)
         } | {key for (key,) in execute(url, "SELECT trial_key FROM trial WHERE status = 'failed'")}
 
-    def test_what_a_running_launch_has_stays(self, grid: int, command: Run, url: str) -> None:
-        before = everything(url)
-        for how in ("--dry-run", "--yes"):
-            answer = command("prune", "--env", "pendulum", how)
-            assert answer.out.startswith("There is no trial to delete. 6 more stay")
-        assert grid
-        assert everything(url) == before
-
-    def test_a_launch_that_began_since_keeps_its_trials(
-        self, grid: int, store: Store, url: str
-    ) -> None:
-        """The deletion itself looks which launches live."""
-        before = everything(url)
-        assert grid
-        assert store.prune([one.trial_key for one in (*DONE, RUNNING, *WAITING)]) == 0
-        assert everything(url) == before
-
-    def test_deleted_trials_run_again(self, ended: int, store: Store, command: Run) -> None:
+    def test_deleted_trials_run_again(self, store: Store, command: Run) -> None:
         command("prune", "--policy", "random", "--env", "pendulum", "--yes")
         launch = store.begin_launch(LAUNCH)
-        assert ended
         assert len(store.register(launch, DONE).todo) == len(DONE)
 
     @pytest.mark.parametrize(
@@ -272,11 +262,10 @@ class TestPrune:
         ],
     )
     def test_a_wrong_rule_is_refused(
-        self, ended: int, command: Run, url: str, words: list[str], message: str
+        self, command: Run, url: str, words: list[str], message: str
     ) -> None:
         before = everything(url)
         answer = command("prune", *words)
-        assert ended
         assert answer.code == 2
         assert message in answer.err
         assert everything(url) == before

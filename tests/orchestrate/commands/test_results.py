@@ -210,19 +210,13 @@ def test_a_table_for_people(ask: Run) -> None:
     assert answer.err == ""
 
 
-def test_csv_holds_every_digit(ask: Run) -> None:
-    answer = ask("query", STEPS, "--csv")
-    head, *rows = csv.reader(io.StringIO(answer.out))
-    assert head == ["t", "loss"]
-    assert [float(loss) for _, loss in rows] == result(DONE[0].seed).loss.tolist()
-
-
-def test_json_has_columns_and_rows(ask: Run) -> None:
-    answer = ask("query", STEPS, "--json")
-    assert answer.document["columns"] == ["t", "loss"]
-    losses = [loss for _, loss in answer.document["rows"]]
-    assert losses == result(DONE[0].seed).loss.tolist()
-    assert answer.document["cut"] is False
+def test_csv_and_json_hold_every_digit(ask: Run) -> None:
+    head, *rows = csv.reader(io.StringIO(ask("query", STEPS, "--csv").out))
+    document, expected = ask("query", STEPS, "--json").document, result(DONE[0].seed).loss.tolist()
+    assert head == document["columns"] == ["t", "loss"]
+    assert [float(loss) for _, loss in rows] == expected
+    assert [loss for _, loss in document["rows"]] == expected
+    assert document["cut"] is False
 
 
 @on_both
@@ -302,10 +296,7 @@ def test_a_failed_trial_shows_every_attempt(store: Store, ask: Run, grid: int) -
     assert "Traceback of attempt 2\nTraceback (most recent call last):" in answer.out
     attempts = ask("show", spec.trial_key[:8], "--json").document["attempts"]
     assert [attempt["cause"] for attempt in attempts] == ["exception", "timeout"]
-    assert [attempt["message"] for attempt in attempts] == [
-        "seed 3 is broken",
-        "seed 77 is broken",
-    ]
+    assert [attempt["message"] for attempt in attempts] == ["seed 3 is broken", "seed 77 is broken"]
 
 
 def test_a_diverged_trial_has_null_where_it_is_not_finite(ask: Run) -> None:
@@ -342,15 +333,12 @@ def test_names_instead_of_a_key(ask: Run) -> None:
     assert answer.out.startswith(BAD.trial_key[:12])
 
 
-def test_what_is_ambiguous_is_refused_with_the_choices(ask: Run) -> None:
+def test_what_is_ambiguous_is_refused_with_choices_told_apart(ask: Run, store: Store) -> None:
     answer = ask("show", "--env", "cartpole", "--seed", "0")
     assert answer.code == 2
     assert "2 trials have these names, one is expected: give the key of one of" in answer.err
     assert RUNNING.trial_key[:12] in answer.err
     assert "(cartpole, random, width=8, seed 0)" in answer.err
-
-
-def test_choices_have_labels_that_tell_them_apart(ask: Run, store: Store) -> None:
     number = store.begin_launch(LAUNCH)
     others = [Spec(9, gamma=0.5), Spec(9, gamma=3.0, task="control")]
     store.register(number, others)

@@ -23,14 +23,7 @@ from orchestrate.program import UsageError, length_of_time, visible
 from orchestrate.runner import start as runner
 from orchestrate.runner import worker
 from orchestrate.runner.start import Work
-from orchestrate.store import (
-    Claim,
-    ConfigRow,
-    Failure,
-    LaunchRecord,
-    Reader,
-    Store,
-)
+from orchestrate.store import Claim, ConfigRow, Failure, LaunchRecord, Reader, Store
 from tests.orchestrate.commands.conftest import Answer, failure, on_both, run_now
 from tests.orchestrate.runner.test_scheduler import Scripted, finish, keys
 from tests.orchestrate.standins import quick, raising, unusable
@@ -189,10 +182,6 @@ class TestTable:
         return rows(console.file.getvalue())  # type: ignore[attr-defined]
 
 
-def test_control_characters_are_shown_as_text() -> None:
-    assert plain("a\x1b[31mb\r\nd").plain == "a\\x1b[31mb\\r\nd"
-
-
 EVIL = "\x1b]52;c;cm0gLXJmIH4=\x07\x1b[2J\x9b31m\r\u202egpj.exe\x00"
 SHOWN = r"\x1b]52;c;cm0gLXJmIH4=\x07\x1b[2J\x9b31m\r\u202egpj.exe"
 STORED = EVIL.rstrip("\0")
@@ -275,6 +264,7 @@ def test_letters_of_every_language_stay() -> None:
     text = "déjà vu, Ελληνικά, 日本語, עברית, العربية, 👩‍🔬 ∞\tµ\n"
     assert visible(text) == text
     assert visible(EVIL) == SHOWN + r"\x00"
+    assert plain("a\x1b[31mb\r\nd").plain == "a\\x1b[31mb\\r\nd"
 
 
 GRID = ("-m", "env=pendulum", "policy=random,uniform", "seed=range(3)", "env.horizon=5")
@@ -380,18 +370,13 @@ def test_a_worker_ends_when_the_rest_cannot_run_here(
     assert err.count("give a lower --processes") == 2
 
 
-@pytest.mark.parametrize(
-    ("given", "seconds"),
-    [("55m", 3300.0), ("1h30m", 5400.0), ("90", 90.0), ("0.5s", 0.5), ("2d", 172_800.0)],
-)
-def test_a_length_of_time(given: str, seconds: float) -> None:
-    assert length_of_time("--until")(given) == seconds
-
-
-@pytest.mark.parametrize("given", ["", "m", "5x", "-3m", "0"])
-def test_a_wrong_length_of_time_is_refused(given: str) -> None:
-    with pytest.raises(UsageError, match="such as 55m"):
-        length_of_time("--until")(given)
+def test_lengths_of_time() -> None:
+    read, known = length_of_time("--until"), {"55m": 3300.0, "1h30m": 5400.0, "90": 90.0}
+    for given, seconds in (known | {"0.5s": 0.5, "2d": 172_800.0}).items():
+        assert read(given) == seconds
+    for wrong in ("", "m", "5x", "-3m", "0"):
+        with pytest.raises(UsageError, match="such as 55m"):
+            read(wrong)
 
 
 def test_every_trial_is_rebuilt_as_it_was_registered(command_line: Launch, pull: Launch) -> None:

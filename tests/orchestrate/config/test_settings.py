@@ -146,12 +146,10 @@ def test_every_config_gets_its_first_seed_before_any_gets_its_second() -> None:
 
 
 def test_a_trial_that_is_named_twice_is_one_trial() -> None:
+    """Also by an integer and an equal float."""
     grid = build_grid([combination((0, 1, 1)), combination(None, env={"name": "pendulum"})])
     assert [trial.seed for trial in grid.trials] == [0, 1]
     assert (grid.n_jobs, grid.repeats) == (4, 2)
-
-
-def test_an_integer_and_an_equal_float_name_one_trial() -> None:
     grid = build_grid(
         [combination((0,), env={"name": "pendulum", "gamma": gamma}) for gamma in (2, 2.0)]
     )
@@ -250,62 +248,40 @@ hydra:
 """
 
 
-@pytest.fixture
-def several(tmp_path: Path) -> tuple[str, ...]:
-    """Return the words that choose an experiment of two grids, which share the uniform arm."""
+TYPED = """
+# @package _global_
+hydra:
+  sweeper:
+    grids: [{policy: beyond/task, policy.goal: [1, 0.5], policy.count: 3, seed: 7}]
+"""
+"""Values of a grid are those of YAML."""
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("-m", 0, "9 trials, 0 done, 9 to run"),  # 2 × 3 and 2 × 3, of which 3 are the same
+        ("-m seed=5 env=pendulum", 0, "2 trials, 0 done, 2 to run"),  # holds for every grid
+        ("seed=5 env=pendulum", 2, "experiment=several is a grid (policy=uniform): add -m"),
+        ("-m policy.iterations=3", 0, "policy.iterations applies to policy=uniform only\n"),
+        ("-m policy.iteratons=3", 2, "did you mean 'iterations'? Choose one of iterations."),
+        ("-m experiment=typed", 0, "1 trial, 0 done, 1 to run"),
+    ],
+)
+def test_an_experiment_can_be_several_grids(
+    command_line: CommandLine, tmp_path: Path, words: str, code: int, said: str
+) -> None:
+    """What is said of a setting does not count the grids that never asked for it."""
     folder = tmp_path / "settings/experiment"
     folder.mkdir(parents=True)
     (folder / "several.yaml").write_text(SEVERAL)
-    return "--config-dir", str(folder.parent), "experiment=several"
-
-
-def test_an_experiment_can_be_several_grids(
-    command_line: CommandLine, several: tuple[str, ...]
-) -> None:
-    code, output, errors = command_line("-m", *several, "launch.dry_run=true")
-    assert (code, errors) == (0, "")
-    assert "9 trials, 0 done, 9 to run" in output  # 2 × 3 and 2 × 3, of which 3 are the same
-
-
-def test_values_of_a_grid_are_those_of_yaml(command_line: CommandLine, tmp_path: Path) -> None:
-    folder = tmp_path / "settings/experiment"
-    folder.mkdir(parents=True)
-    values = "{policy: beyond/task, policy.goal: [1, 0.5], policy.count: 3, seed: 7}"
-    words = f"# @package _global_\nhydra:\n  sweeper:\n    grids: [{values}]\n"
-    (folder / "typed.yaml").write_text(words)
-    given = ("-m", "--config-dir", str(folder.parent), "experiment=typed")
-    code, output, errors = command_line(*given, "launch.dry_run=true")
-    assert (code, errors) == (0, "")
-    assert "1 trial, 0 done, 1 to run" in output
-
-
-def test_a_word_of_the_command_line_holds_for_every_grid(
-    command_line: CommandLine, several: tuple[str, ...]
-) -> None:
-    code, output, _ = command_line("-m", *several, "seed=5", "env=pendulum", "launch.dry_run=true")
-    assert code == 0
-    assert "2 trials, 0 done, 2 to run" in output
-
-
-def test_several_grids_are_no_single_trial(
-    command_line: CommandLine, several: tuple[str, ...]
-) -> None:
-    code, _, errors = command_line(*several, "seed=5", "env=pendulum", "launch.dry_run=true")
-    assert code == 2
-    assert "experiment=several is a grid (policy=uniform): add -m" in errors
-
-
-def test_a_setting_holds_for_the_grids_that_have_it(
-    command_line: CommandLine, several: tuple[str, ...]
-) -> None:
-    """And what is said of it does not count the grids that never asked for it."""
-    more = ("-m", *several, "policy.iterations=3", "launch.dry_run=true")
-    code, output, errors = command_line(*more)
-    assert (code, errors) == (0, "")
-    assert output.startswith("policy.iterations applies to policy=uniform only\n")
-    code, _, errors = command_line("-m", *several, "policy.iteratons=3", "launch.dry_run=true")
-    assert code == 2
-    assert "did you mean 'iterations'? Choose one of iterations." in errors
+    (folder / "typed.yaml").write_text(TYPED)
+    chosen = [] if "experiment=" in words else ["experiment=several"]
+    given = ["--config-dir", str(folder.parent), *chosen, *words.split(), "launch.dry_run=true"]
+    found, output, errors = command_line(*given)
+    assert (found, bool(errors)) == (code, code != 0)
+    assert said in output + errors
+    assert "applies to" not in output or output.startswith(said)
 
 
 SHORT = ("env.horizon=5", "executor=inprocess")

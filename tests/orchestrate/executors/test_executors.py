@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from dopt.result import TrialResult
-from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
 from orchestrate.executors.base import (
@@ -40,7 +39,7 @@ from tests.dopt.trials import trial
 from tests.orchestrate.executors.conftest import ALL, WITH_PROCESSES, WORKERS
 from tests.orchestrate.loaded_modules import report_modules
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
-from tests.paths import ROOT
+from tests.paths import ROOT, ran
 from tests.waiting import until
 
 Make = Callable[[Run], Executor]
@@ -67,10 +66,6 @@ def drain(executor: Executor) -> list[Event]:
 
     until(is_idle, lambda: f"there is only {events}")
     return events
-
-
-def done(events: Sequence[Event]) -> list[TaskDone]:
-    return [event for event in events if isinstance(event, TaskDone)]
 
 
 def report_threads(_: TrialSpec) -> TrialResult:
@@ -248,27 +243,19 @@ def test_a_worker_of_the_local_executor_loads_no_heavy_library() -> None:
     assert not loaded & {"torch", "pandas", "sqlalchemy", "hydra", "omegaconf", "matplotlib", "ray"}
 
 
-def in_lockstep(*specs: TrialSpec) -> list[TaskDone]:
+@pytest.mark.parametrize(
+    ("policies", "kind"), [(["random"] * 2, TrialResult), (["d_optimal", "random"], Failure)]
+)
+def test_what_cannot_run_together_is_every_trials_trouble(policies: list[str], kind: type) -> None:
+    specs = [trial("pendulum", one, seed) for seed, one in enumerate(policies)]
     with LockstepExecutor("cpu", batch=len(specs)) as executor:
         executor.submit([Task(spec.trial_key, spec) for spec in specs])
         events = executor.wait(0.1)
         assert executor.pending == 0
-    assert [event.key for event in done(events)] == [spec.trial_key for spec in specs]
-    return done(events)
-
-
-def test_a_chunk_is_run_as_one_batch() -> None:
-    specs = [trial("pendulum", "d_optimal", seed, env={"horizon": 8}) for seed in range(3)]
-    for event, spec in zip(in_lockstep(*specs), specs, strict=True):
-        assert isinstance(event.outcome, TrialResult)
-        alone = run_trial(spec, "reference")
-        assert event.outcome.loss == pytest.approx(alone.loss, rel=1e-9)
-        assert event.outcome.inputs == pytest.approx(alone.inputs, rel=1e-9)
-
-
-def test_what_cannot_run_together_is_every_trials_trouble() -> None:
-    mixed = (trial("pendulum", policy, env={"horizon": 8}) for policy in ("d_optimal", "random"))
-    assert all(isinstance(event.outcome, Failure) for event in in_lockstep(*mixed))
+    assert [event.key for event in events if isinstance(event, TaskDone)] == [
+        spec.trial_key for spec in specs
+    ]
+    assert all(isinstance(event.outcome, kind) for event in events)
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda:0"])
@@ -370,12 +357,5 @@ def test_local_processes_load_neither_ray_nor_torch(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(LAUNCH)
     words = ["-m", "env.horizon=5", "policy=random", "seed=0,1", "executor=local"]
-    done = subprocess.run(
-        [sys.executable, str(program), *words, "launch.workers=1"],
-        cwd=tmp_path,
-        env={"PATH": "", "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = ran(program, *words, "launch.workers=1", folder=tmp_path, PYTHONPATH=str(ROOT))
     assert json.loads(done.stdout.splitlines()[-1]) == [0, []], done.stderr

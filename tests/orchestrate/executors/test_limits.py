@@ -27,13 +27,7 @@ from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.conftest import ALL, ON_RAY, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.faults.laboratory import alive
-from tests.orchestrate.standins import (
-    BROKEN_SEED,
-    deadly,
-    exiting,
-    malformed,
-    raising,
-)
+from tests.orchestrate.standins import BROKEN_SEED, deadly, exiting, malformed, raising
 from tests.orchestrate.unruly import (
     deaf,
     empty,

@@ -54,16 +54,13 @@ def test_a_chunk_holds_the_wanted_seconds(cost: float | None, size: int) -> None
     assert len(chunks(cost=cost).next()) == size
 
 
-def test_cheap_trials_are_bounded_and_get_fewer_towards_the_end() -> None:
+def test_cheap_trials_are_bounded_get_fewer_and_keep_their_order() -> None:
+    assert list(itertools.chain(*given(chunks(TRIALS[:50], 0.2)))) == TRIALS[:50]
     sizes = [len(chunk) for chunk in given(chunks(cost=1e-6))]
     assert sum(sizes) == len(TRIALS)
     assert max(sizes) == MAX_CHUNK_TRIALS
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] == 1
-
-
-def test_the_order_is_kept_and_nothing_is_given_twice() -> None:
-    assert list(itertools.chain(*given(chunks(TRIALS[:50], 0.2)))) == TRIALS[:50]
 
 
 def test_a_lost_trial_comes_first_and_alone() -> None:
@@ -266,11 +263,8 @@ def test_what_does_not_fit_is_refused_with_what_decides(
         check_memory(grid(seeds, 100), settings, machine=gib and gib * BYTES_PER_GIB)
 
 
-def test_this_machine_has_memory() -> None:
-    assert 2**28 < memory_of_this_machine() < 2**50
-
-
 def test_only_the_cores_that_we_may_use_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert 2**28 < memory_of_this_machine() < 2**50
     monkeypatch.setattr("os.cpu_count", lambda: 64)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {3})
     check_memory(grid(100, 100), launch(), machine=2 * BYTES_PER_GIB)

@@ -69,9 +69,7 @@ def test_the_rate_is_that_of_the_last_half_minute(clock: Callable[[float], None]
     assert "2.0/s" in shown.line()
 
 
-def test_a_file_gets_a_line_now_and_then_and_one_at_the_end(
-    clock: Callable[[float], None],
-) -> None:
+def test_a_file_gets_a_line_now_and_then_and_one_at_the_end(clock: Callable[[float], None]) -> None:
     stream = io.StringIO()
     tally = Tally(total=100)
     with Progress(tally, stream) as shown:
@@ -120,16 +118,15 @@ def commit(folder: Path, name: str) -> None:
     git(folder, "commit", "-m", "Add a file")
 
 
-def test_outside_a_repository_there_is_no_commit(tmp_path: Path) -> None:
+def test_outside_a_repository_there_is_no_commit_but_that_of_the_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     record = launch_record(["launch.py"], ["seed=1"], tmp_path)
     assert (record.git_commit, record.git_dirty, record.git_diff_hash) == (None, None, None)
     assert record.overrides == ["seed=1"]
     assert {"python", "numpy", "numba", "hydra-core"} <= set(record.versions)
-
-
-def test_an_image_without_its_repository_says_the_commit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    assert {"llvmlite", "cpu", "cpu_model", "cpu_features", "platform"} <= set(record.versions)
+    assert all(record.versions.values())
     monkeypatch.setenv("DOPT_COMMIT", "c" * 40)
     record = launch_record([], [], tmp_path)
     assert (record.git_commit, record.git_dirty) == ("c" * 40, None)
@@ -159,12 +156,6 @@ def test_a_repository_around_an_installed_copy_is_not_that_of_the_code(tmp_path:
     installed = tmp_path / "site-packages"
     installed.mkdir()
     assert launch_record([], [], installed).git_commit is None
-
-
-def test_the_processor_and_what_compiles_for_it_are_named(tmp_path: Path) -> None:
-    versions = launch_record([], [], tmp_path).versions
-    assert {"llvmlite", "cpu", "cpu_model", "cpu_features", "platform"} <= set(versions)
-    assert all(versions.values())
 
 
 def test_untracked_results_and_builds_leave_the_code_clean(tmp_path: Path) -> None:

@@ -238,11 +238,3 @@ def test_a_narrow_interval_needs_values_that_have_a_logarithm() -> None:
     assert is_narrow(same, 0.01)
     for losses in (same[1:], np.append(same, np.inf), np.append(same, 0.0), np.array([])):
         assert not is_narrow(losses, 0.01)
-
-
-def test_a_wider_interval_stops_no_later() -> None:
-    losses = np.exp(0.2 * np.random.default_rng(1).standard_normal(100))
-    narrow = [is_narrow(losses, relative) for relative in (0.01, 0.05, 0.1, 0.5)]
-    assert narrow == sorted(narrow)
-    assert narrow[0] is False
-    assert narrow[-1] is True

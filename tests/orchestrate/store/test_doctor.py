@@ -96,10 +96,7 @@ def test_damage_is_found(grid: str, harms: str, severity: str, words: str, count
 @pytest.mark.parametrize(
     ("harms", "words"),
     [
-        (
-            "DELETE FROM assessment WHERE trial_id = 1 AND t = 3",
-            "that lack assessments: 1",
-        ),
+        ("DELETE FROM assessment WHERE trial_id = 1 AND t = 3", "that lack assessments: 1"),
         ("DELETE FROM assessment WHERE trial_id = 1", "that lack assessments: 1"),
         (
             "UPDATE trial SET status = 'failed' WHERE trial_id = 1",

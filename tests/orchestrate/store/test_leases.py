@@ -25,7 +25,7 @@ from orchestrate.store.store import LEASE_SECONDS
 from tests.dopt.trials import trial
 from tests.orchestrate.losses import lose
 from tests.orchestrate.store.databases import execute
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, diverged, result
+from tests.orchestrate.store.fakes import FAILURE, LAUNCH, RUN, Spec, begin, diverged, result
 from tests.orchestrate.store.processes import hear, running
 from tests.waiting import PATIENCE_SECONDS, until
 
@@ -130,19 +130,6 @@ def test_a_trial_in_compiled_code_does_not_silence_it(
     assert store.commit(claim, result(), RUN)
 
 
-FAILURE = Failure("ValueError", "bad", "here")
-
-
-@pytest.fixture
-def one(open_store: Callable[..., Store]) -> Store:
-    return open_store()
-
-
-@pytest.fixture
-def two(open_store: Callable[..., Store]) -> Store:
-    return open_store()
-
-
 @pytest.fixture
 def interrupt() -> Iterator[Callable[..., list[Any]]]:
     """Return what calls a function once, after a store's first statement with such a beginning."""
@@ -167,12 +154,9 @@ def interrupt() -> Iterator[Callable[..., list[Any]]]:
 
 @pytest.mark.parametrize("beginning", ["DELETE FROM step", "UPDATE trial"])
 def test_an_outcome_that_comes_during_a_retry_keeps_its_rows(
-    one: Store,
-    two: Store,
-    url: str,
-    interrupt: Callable[..., list[Any]],
-    beginning: str,
+    open_store: Callable[..., Store], url: str, interrupt: Callable[..., list[Any]], beginning: str
 ) -> None:
+    one, two = open_store(), open_store()
     launch, other = one.begin_launch(LAUNCH), two.begin_launch(LAUNCH)
     keys = one.register(launch, [Spec(0), Spec(1)]).todo
     before, during = one.claim(launch, keys)
@@ -189,8 +173,9 @@ def test_an_outcome_that_comes_during_a_retry_keeps_its_rows(
 
 
 def test_a_traceback_is_not_pruned_while_a_trial_comes_to_refer_to_it(
-    one: Store, two: Store, interrupt: Callable[..., list[Any]]
+    open_store: Callable[..., Store], interrupt: Callable[..., list[Any]]
 ) -> None:
+    one, two = open_store(), open_store()
     launch = one.begin_launch(LAUNCH)
     keys = one.register(launch, [Spec(0)]).todo
     one.fail(one.claim(launch, keys)[0], FAILURE, RUN)
@@ -203,18 +188,18 @@ def test_a_traceback_is_not_pruned_while_a_trial_comes_to_refer_to_it(
 
 
 def test_a_merge_uses_the_traceback_that_a_launch_has_inserted_meanwhile(
-    one: Store, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: Store, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = f"sqlite:///{tmp_path}/other.db"
     with Store.open(other) as filled:
         launch, (failed,) = begin(filled, Spec(0))
         filled.fail(failed, FAILURE, RUN)
         filled.end_launch(launch, "failed")
-    launch, (claim,) = begin(one, Spec(1))
+    launch, (claim,) = begin(store, Spec(1))
     read = Source.error
 
     def fail_meanwhile(source: Source, digest: str) -> dict[str, Any]:
-        assert one.fail(claim, FAILURE, RUN)
+        assert store.fail(claim, FAILURE, RUN)
         return read(source, digest)
 
     monkeypatch.setattr(Source, "error", fail_meanwhile)

@@ -22,6 +22,7 @@ from tests.orchestrate.store.databases import file_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
 
 SPECS = [Spec(seed) for seed in range(4)]
+Change = Callable[[Path, Path], object]
 DONE = "SELECT seed FROM v_trial WHERE status = 'done' ORDER BY seed"
 
 
@@ -54,10 +55,6 @@ def deleted(folder: Path, _: Path) -> None:
         path.unlink() if path.is_file() else None
 
 
-def deleted_alone(folder: Path, _: Path) -> None:
-    (folder / "real" / "file.db").unlink()
-
-
 def renamed(folder: Path, _: Path) -> None:
     (folder / "real" / "file.db").rename(folder / "moved.db")
 
@@ -72,34 +69,17 @@ def retargeted(folder: Path, other: Path) -> None:
     (folder / "results.db").symlink_to(other)
 
 
-def without_link(folder: Path, _: Path) -> None:
-    (folder / "results.db").unlink()
-
-
-def folder_renamed(folder: Path, _: Path) -> None:
-    (folder / "real").rename(folder / "elsewhere")
-
-
-def without_log(folder: Path, _: Path) -> None:
-    (folder / "real" / "file.db-wal").unlink()
-
-
-def without_shared_memory(folder: Path, _: Path) -> None:
-    (folder / "real" / "file.db-shm").unlink()
-
-
-CHANGES = (
-    deleted,
-    deleted_alone,
-    renamed,
-    replaced,
-    retargeted,
-    without_link,
-    folder_renamed,
-    without_log,
-    without_shared_memory,
-)
-Change = Callable[[Path, Path], None]
+CHANGES: dict[str, Change] = {
+    "deleted": deleted,
+    "deleted alone": lambda folder, _: (folder / "real" / "file.db").unlink(),
+    "renamed": renamed,
+    "replaced": replaced,
+    "retargeted": retargeted,
+    "without its link": lambda folder, _: (folder / "results.db").unlink(),
+    "folder renamed": lambda folder, _: (folder / "real").rename(folder / "elsewhere"),
+    "without its log": lambda folder, _: (folder / "real" / "file.db-wal").unlink(),
+    "without shared memory": lambda folder, _: (folder / "real" / "file.db-shm").unlink(),
+}
 
 
 def content(folder: Path) -> dict[Path, bytes]:
@@ -117,14 +97,14 @@ def done(path: Path) -> list[int]:
         return [row.seed for row in reader.rows(DONE)]
 
 
-@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", CHANGES)
 def test_what_it_holds_is_saved_and_nothing_else_is_written(
-    change: Change, url: str, folder: Path, other: Path
+    name: str, url: str, folder: Path, other: Path
 ) -> None:
     with Store.open(url) as store:
         _, claims = begin(store, *SPECS)
         assert store.commit(claims[0], result(0), RUN)
-        change(folder, other)
+        CHANGES[name](folder, other)
         before, others = content(folder), other.read_bytes()
         with pytest.raises(DatabaseMovedError, match="since it was opened") as caught:
             store.commit(claims[1], result(1), RUN)
@@ -138,12 +118,12 @@ def test_what_it_holds_is_saved_and_nothing_else_is_written(
     assert other.read_bytes() == others
     new = {path for path in {*content(folder)} - {*before} if ".saved-" not in path.name}
     assert not {path for path in new if path.suffix == ".db"}
-    if change is replaced:
+    if name == "replaced":
         assert (folder / "real" / "file.db").read_bytes() == others
         assert done(folder / "results.db") == []
     assert store.safe_url in str(caught.value)
     assert "\n" not in str(caught.value)
-    if change is renamed:
+    if name == "renamed":
         assert f"is now {folder / 'moved.db'}" in str(caught.value)
         with closing(sqlite3.connect(folder / "moved.db")) as moved:
             assert moved.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
@@ -261,34 +241,11 @@ TABLES = {
         "/home/ada/results/results.db",
         ("/home", "nfs4"),
     ),
-    "scratch on Lustre, home on local disks": (
-        "24 1 253:0 / / rw,relatime shared:1 - xfs /dev/mapper/rl-root rw,attr2,inode64\n"
-        "97 24 253:2 / /home rw,relatime shared:52 - xfs /dev/mapper/rl-home rw,attr2,inode64\n"
-        "139 24 0:57 / /lustre/scratch rw,relatime shared:70 - lustre 10.1.0.1@o2ib:/scratch rw\n",
-        "/lustre/scratch/ada/results.db",
-        ("/lustre/scratch", "lustre"),
-    ),
-    "GPFS": (
-        ROOT + "188 29 0:61 / /gpfs/fs1 rw,relatime shared:88 - gpfs fs1 rw,maxblocksize=16384k\n",
-        "/gpfs/fs1/group/results.db",
-        ("/gpfs/fs1", "gpfs"),
-    ),
     "a share of Windows with a space in its name": (
         ROOT + r"301 29 0:71 / /mnt/lab\040data rw,relatime shared:150 - cifs //filer/lab rw,"
         "vers=3.1.1,cache=strict,username=ada\n",
         "/mnt/lab data/results.db",
         ("/mnt/lab data", "cifs"),
-    ),
-    "BeeGFS": (
-        ROOT + "150 29 0:55 / /mnt/beegfs rw,relatime - beegfs beegfs_nodev rw,cfgFile=/etc/b\n",
-        "/mnt/beegfs/results.db",
-        ("/mnt/beegfs", "beegfs"),
-    ),
-    "a folder of another machine by ssh": (
-        ROOT + "55 29 0:24 / /sys/fs/fuse/connections rw - fusectl fusectl rw\n"
-        "420 29 0:60 / /home/ada/remote rw,nosuid,nodev - fuse.sshfs ada@hpc: rw,user_id=1000\n",
-        "/home/ada/remote/runs/results.db",
-        ("/home/ada/remote", "fuse.sshfs"),
     ),
     "a local disk mounted below a home on NFS": (
         ROOT + "412 29 0:52 / /home rw - nfs nas:/export/home rw,vers=3,nolock\n"
@@ -317,6 +274,7 @@ TABLES = {
 LOCAL = {"ext4", "xfs", "btrfs", "zfs", "overlay", "tmpfs", "fuseblk", "fuse.mergerfs", "ntfs3"}
 SHARED = {
     *("nfs", "nfs4", "cifs", "smb3", "9p", "ceph", "fuse.sshfs", "fuse.glusterfs"),
+    *("lustre", "gpfs", "beegfs"),
     *("virtiofs", "vboxsf", "prl_fs", "drvfs", "fakeowner"),  # a virtual machine and its host
     *("vmhgfs", "fuse.vmhgfs-fuse", "fuse.grpcfuse", "fuse.osxfs", "fuse", "lxfs", "unheard_of"),
 }
@@ -329,20 +287,15 @@ def test_a_table_is_judged(name: str) -> None:
     assert is_network(kind) == (kind not in LOCAL)
 
 
-@pytest.mark.parametrize("kind", sorted(LOCAL))
-def test_what_disks_of_this_machine_hold_is_no_network(kind: str) -> None:
-    assert not is_network(kind)
-
-
-@pytest.mark.parametrize("kind", sorted(SHARED))
+@pytest.mark.parametrize("kind", sorted(SHARED | LOCAL))
 def test_what_is_not_known_to_be_safe_is_refused_unless_the_user_says_that_it_is(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert is_network(kind)
+    assert is_network(kind) == (kind in SHARED)
     monkeypatch.setenv("DOPT_SAFE_FILE_SYSTEMS", f"other, {kind}")
     assert not is_network(kind)
     monkeypatch.setenv("DOPT_SAFE_FILE_SYSTEMS", f"{kind}x")
-    assert is_network(kind)
+    assert is_network(kind) == (kind in SHARED)
 
 
 def test_a_database_on_a_network_is_refused_before_anything_is_written(

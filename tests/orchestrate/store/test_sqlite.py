@@ -17,24 +17,11 @@ import pytest
 from sqlalchemy import event
 from sqlalchemy.engine import make_url
 
-from orchestrate.store import (
-    Claim,
-    Reader,
-    Store,
-    StoreError,
-    StoreUnavailableError,
-    sqlite,
-)
+from orchestrate.store import Claim, Reader, Store, StoreError, StoreUnavailableError, sqlite
 from orchestrate.store.maintenance import examine
 from orchestrate.store.sqlite import _is_read_only, read_address
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
-from tests.orchestrate.store.processes import (
-    hear,
-    kill,
-    run_and_stop,
-    running,
-    without_rights,
-)
+from tests.orchestrate.store.processes import hear, kill, run_and_stop, running, without_rights
 
 
 @pytest.fixture

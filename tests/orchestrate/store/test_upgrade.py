@@ -285,11 +285,7 @@ exit 1
     ],
 )
 def test_a_server_without_a_program_that_fits_is_upgraded_without_a_backup_alone(
-    postgresql_url: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    program: str,
-    said: str,
+    postgresql_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, said: str
 ) -> None:
     restore(VERSIONS[-1], postgresql_url)
     before = structure(postgresql_url)
