@@ -63,6 +63,7 @@ class Selection(NamedTuple):
     window: float  # length that was chosen [s]
     delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
+    outliers: Mapping[str, int]  # measurements that were left out, by state
     seed: int  # of the network that was tried
     seconds: float  # wall time of the fit [s]
 

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -284,8 +285,13 @@ def test_standard_errors_are_of_fits_without_each_window() -> None:
 
 
 @pytest.mark.parametrize("supply", [1.7, math.inf])
-def test_a_supply_that_is_not_declared_is_found(supply: float) -> None:
+def test_a_supply_that_is_not_declared_is_found(
+    supply: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is cut is seen where the effect of the input is known."""
+    clock = iter(range(99))
+    ticks = SimpleNamespace(perf_counter=lambda: float(next(clock)))
+    monkeypatch.setattr("dopt.fitting.fit.time", ticks)
     plant, table = declared(), run(2)
     constants = {**plant.constants, "gain": TRUE[0]}
     t, u = (table[name].to_numpy() for name in ("time", "voltage"))
@@ -293,8 +299,9 @@ def test_a_supply_that_is_not_declared_is_found(supply: float) -> None:
     found = dopt.fit(
         dataclasses.replace(plant, constants=constants), table.assign(angle=x[:, 0]), width=0
     )
-    assert found.plant.supply == pytest.approx(supply, rel=0.03)
+    assert found.plant.supply == pytest.approx(supply, rel=0.002)
     assert ("inputs beyond" in found.report()) == (supply < math.inf)
+    assert found.selection.seconds == next(clock) - 1, "from the first fit to the last"
 
 
 def test_a_network_is_refused_where_the_constants_tell_all() -> None:
