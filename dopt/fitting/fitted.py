@@ -446,7 +446,7 @@ class Fitted:
         return trial.trial_key
 
     def save(self, path: str | Path) -> None:
-        """Write the model as arrays (.npz), which NumPy alone reads (:meth:`store`: a database)."""
+        """Write the model as arrays (.npz), which NumPy alone reads; pickle keeps the whole fit."""
         from dopt.fitting.export import save
 
         if "://" in str(path):

@@ -38,13 +38,10 @@ def drive(one: Explorer, steps: int, delay: int = 0, noise: float = 1e-3) -> Non
 def follow(one: Explorer, rig: Rig, counts: int) -> None:
     """Let a rig whose angle is measured by an encoder follow the answers, to the last step."""
     quantum = encoder(counts).quantum
-
-    def measured() -> Array:
-        return np.asarray(np.round(rig.x[:1] / quantum) * quantum)
-
+    y = quantum * np.round(rig.x[:1] / quantum)
     while one.n_steps < one.spec.system.horizon:
-        rig.step(one.ask(measured()))
-        one.tell(measured())
+        y = quantum * np.round(rig.step(one.ask(y))[:1] / quantum)
+        one.tell(y)
 
 
 def signs(one: Explorer) -> dict[str, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import pickle
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -330,6 +331,9 @@ def test_bounds_hold_what_they_say_on_another_run(fitted: Fitted) -> None:
     inside = (measured >= simulated.lower[:, 0]) & (measured <= simulated.upper[:, 0])
     assert 0.75 <= inside[later].mean() <= 1.0
     assert 0.8 <= fitted.coverage(0.9)["angle"] <= 0.98
+    read_back = pickle.loads(pickle.dumps(fitted))
+    assert read_back.report() == fitted.report()
+    np.testing.assert_array_equal(read_back.simulate(other)[0].lower, simulated.lower)
 
 
 def test_a_saved_model_needs_numpy_alone(fitted: Fitted, tmp_path: Path) -> None:
