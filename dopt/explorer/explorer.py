@@ -33,8 +33,6 @@ from dopt.systems.base import System
 from dopt.systems.plant import Plant
 from dopt.types import Array
 
-# Calls that Ctrl-C does not break off.
-
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:

@@ -13,7 +13,8 @@ a low-pass filter estimates the states, they begin, end and are driven as it has
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,9 +26,6 @@ from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Array
-
-if TYPE_CHECKING:
-    from dopt.explorer.state import ExplorerState
 
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
@@ -102,6 +100,19 @@ _TEXTS = {
 }
 
 
+class Exploration(Protocol):
+    """What is read of a state of an exploration, except for the counts, which are changed."""
+
+    done: int
+    counts: Counter[str]
+    states: Array
+    excess: Array
+    answer: Array | None
+    was_asked: bool
+    system: System
+    steps: Any  # of the kernel or the reference, in scaled numbers
+
+
 class Signs:
     """Counts of the signs, in the counts of an exploration.
 
@@ -126,7 +137,7 @@ class Signs:
         """Begin at step t from a state that need not follow the one before."""
         self._start = t
 
-    def learned(self, state: ExplorerState, event: Event, seconds: float) -> None:
+    def learned(self, state: Exploration, event: Event, seconds: float) -> None:
         """Count after a step of so many seconds was learned from."""
         done, limits, asked = state.done, self._spec.limits, state.answer
         if state.was_asked and asked is not None and event["applied"] != asked.tolist():
@@ -144,12 +155,12 @@ class Signs:
         if done == AFTER:
             self._measure_box(state)
 
-    def find_supply(self, state: ExplorerState, level: float) -> None:
+    def find_supply(self, state: Exploration, level: float) -> None:
         """Count a fit that found a supply which the plant does not declare."""
         state.counts["supply"] += 1
         self._say("supply", level)
 
-    def _compare(self, change: Array, state: ExplorerState) -> None:
+    def _compare(self, change: Array, state: Exploration) -> None:
         """Count an input that was not applied as it was asked."""
         if np.abs(change).max() <= ROUNDING * self._spec.system.gamma:
             return
@@ -157,7 +168,7 @@ class Signs:
         if (n := state.counts["altered"]) >= max(MANY, COMMON * state.done):
             self._say("altered", n, state.done)
 
-    def _end_block(self, state: ExplorerState) -> None:
+    def _end_block(self, state: Exploration) -> None:
         before, self._parameters = self._parameters, np.array(state.steps.parameters)
         learner, model = self._spec.learner, self._spec.model  # some move them now and then
         refitted = isinstance(learner, SimulationError)
@@ -180,7 +191,7 @@ class Signs:
                 self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
                 self._rows = []
 
-    def _compare_runs(self, state: ExplorerState) -> None:
+    def _compare_runs(self, state: Exploration) -> None:
         """Count where the learned model predicts the last states worse than without it."""
         found, predicted, steps = scaled(state.system), self._spec.model.predict, state.steps
         starts, self._starts = self._starts[-RUNS * AHEAD :], []
@@ -194,7 +205,7 @@ class Signs:
         seen = (estimates and list(found.system.measured_states)) or slice(None)
         x0, u = steps.states[rows[:, 0]], steps.inputs[rows]
         if self._spec.system.n_measured and not estimates:
-            u = steps.trial.state.estimate.inputs[rows]  # type: ignore[union-attr]  # of the kernel
+            u = steps.trial.state.estimate.inputs[rows]  # of the kernel
         ends = steps.states[rows + 1][..., seen].swapaxes(0, 1)
 
         def both(x: Array, u: Array) -> Array:  # the learned accelerations, and none
@@ -212,7 +223,7 @@ class Signs:
             state.counts["worse"] += 1
             self._say("worse", AHEAD, learned / known)
 
-    def _new_rows(self, state: ExplorerState) -> tuple[Array, ...]:
+    def _new_rows(self, state: Exploration) -> tuple[Array, ...]:
         """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).
 
         They are of the last steps, where these follow others without a gap.
@@ -231,7 +242,9 @@ class Signs:
         t = t[(t - starts >= LAGS + differ) & np.append(starts[1:] == starts[:-1], True)]
         at = t[t - first >= 2 * differ] - first  # of which there are such differences
         last = np.stack([u[at - k] for k in range(1 + differ)], axis=-1).reshape(len(at), -1)
-        given = np.hstack([np.ones((len(at), 1)), _features(system, x[at]), last])
+        angles, ones = list(system.angle_indices), np.ones((len(at), 1))
+        turned, others = x[at][:, angles], np.delete(x[at], angles, axis=1)
+        given = np.hstack([ones, others, np.cos(turned), np.sin(turned), last])
         lags = first + at - differ - np.arange(1, LAGS + 1)[:, None]
         return errors[at], moved[at], given, np.moveaxis(inputs[lags], 0, -1)
 
@@ -250,7 +263,7 @@ class Signs:
             return (moved - (following - x[:-1]) / system.dt)[:, rows], moved[:, rows]
 
     def _test(
-        self, state: ExplorerState, errors: Array, moved: Array, given: Array, earlier: Array
+        self, state: Exploration, errors: Array, moved: Array, given: Array, earlier: Array
     ) -> None:
         """Count where inputs of earlier steps explain errors."""
         if not (np.isfinite(errors).all() and np.isfinite(given).all()):
@@ -265,7 +278,7 @@ class Signs:
             state.counts["late"] += 1
             self._say("late", lag, 100.0 * largest)
 
-    def _measure_box(self, state: ExplorerState) -> None:
+    def _measure_box(self, state: Exploration) -> None:
         """Count the sides of the box of which the states so far cover little."""
         system, x = self._spec.system, state.states[: state.done + 1]
         for axis, (low, high) in system.grid_box().items():
@@ -308,10 +321,3 @@ def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array
     found = np.sum((basis.T @ rest) ** 2, axis=0)
     total = np.maximum(np.sum(rest**2, axis=0), np.finfo(float).tiny)
     return found / total, np.sqrt(found / len(errors)), 1 + int(np.argmax(alone))
-
-
-def _features(system: System, states: Array) -> Array:
-    """Return states, (N, d), with the cosine and the sine in the place of each angle."""
-    angles = list(system.angle_indices)
-    turned = states[:, angles]
-    return np.hstack([np.delete(states, angles, axis=1), np.cos(turned), np.sin(turned)])
