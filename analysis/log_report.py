@@ -249,6 +249,9 @@ UNEVEN = 0.05
 
 _MANY_TURNS = 100.0  # radians
 
+_NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)[\])]?$")
+"""Ends of names that say a unit which is of no angle."""
+
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Add the file and the options of the command."""
@@ -289,7 +292,8 @@ def run(options: argparse.Namespace) -> int:
         angles=angles,
         units=units,
     )
-    declared = {*angles, *units} | {name for name, one in (states or {}).items() if one in units}
+    declared = {name for name, one in (states or {}).items() if one in units}
+    declared |= {*angles, *units, "" if options.dt is None else "time"}
     health, file = examine(log), Path(options.file)
     guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
     for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, declared)):
@@ -322,12 +326,13 @@ def lines(
 ) -> Iterator[str]:
     """Yield the sentences of the report: sampling, signals, inputs, suspicions, notes.
 
-    The units of ``declared`` states are not doubted.
+    The units of ``declared`` states, or of the "time", are not doubted.
     """
-    yield f"sampling: {_sampling(log, health)}"
+    told = "time" in declared or any("Stamps are" in one or " dates:" in one for one in log.notes)
+    yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:
         yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
-        yield from _units(one, one.name in declared)
+        yield from _units(one, one.name in declared or bool(_NO_ANGLE.search(one.name)))
     for one in health.inputs:
         yield f"{one.name}: {_signal(one)}{_limits(one)}"
     wrapped = [one.name for one in health.states if not math.isnan(one.period)]
@@ -346,16 +351,19 @@ def lines(
     yield from (f"note: {note}" for note in log.notes)
 
 
-def _sampling(log: Log, health: Health) -> str:
-    unit, scale = ("ms", 1e3) if health.step < 1 else ("s", 1.0)
-    shown = [number(scale * one) for one in (health.step, health.shortest, health.longest)]
-    text = f"median step {shown[0]} {unit}, {shown[1]} to {shown[2]} {unit}"
-    if shown[1] == shown[2]:
-        text = f"every {shown[0]} {unit}"
+def _seconds(time: float) -> str:
+    return f"{number(1e3 * time)} ms" if time < 1 else f"{number(time)} s"
+
+
+def _sampling(log: Log, health: Health, told: bool) -> str:
+    steps = [_seconds(one) for one in (health.step, health.shortest, health.longest)]
+    text = f"median step {steps[0]}, {steps[1]} to {steps[2]}"
+    if steps[1] == steps[2]:
+        text = f"every {steps[0]}"
     if health.irregular > 0:
         text += f", {100 * health.irregular:.2g} % of the steps off by more than 20 %"
     text += f", {len(log.pieces)} piece{'s' * (len(log.pieces) > 1)} without gaps"
-    if health.step >= 1:
+    if health.step >= 1 and not told:
         likely = "ms" if health.step < 1e3 else "us" if health.step < 1e6 else "ns"
         text += f"; stamps in {likely}? A step of {number(health.step)} s is long: "
         text += f"--units time={likely}"
@@ -435,9 +443,9 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
     else:
         first, last = (max(0, one) for one in effect.delays)
         samples = f"{first}" if first == last else f"{first} to {last}"
-        step = number(1e3 * health.step)
         about = "; about, as noise is fed back" * effect.closed_loop
-        yield f"{pair}: suspected delay: {samples} sample{'s' * (last != 1)} of {step} ms{about}"
+        samples += f" sample{'s' * (last != 1)} of {_seconds(health.step)}"
+        yield f"{pair}: suspected delay: {samples}{about}"
     if effect.follows_state:
         yield f"{effect.input}: closed loop, or as regular as the motion: a function of the state"
     elif effect.closed_loop:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -94,10 +95,10 @@ def _column(values: Any) -> npt.NDArray[Any]:
 
 
 def clock_column(
-    table: Mapping[str, Any], time: Any, dt: float | None, notes: list[str]
+    table: Mapping[str, Any], taken: Collection[str], time: Any, dt: float | None, notes: list[str]
 ) -> str | None:
     """Return the name of the column of the stamps, None where they are given or made of dt."""
-    found = [name for name in table if is_clock(name)]
+    found = [name for name in table if is_clock(name) and name not in taken]
     if time is not None and dt is not None:
         raise SpecificationError(
             f"a log has the time {time if isinstance(time, str) else 'of an array'!r} and dt = "
@@ -241,9 +242,8 @@ def stamps_of(
     factor = 1.0 if unit == 1.0 else _factor(name, unit, SECONDS)
     if factor != 1.0:
         notes.append(f"Stamps are multiplied by {factor:g} to be seconds.")
-    if values.dtype.kind in "iu" and not np.ma.isMaskedArray(
-        values
-    ):  # ns since 1970 have more digits than a float
+    is_whole = values.dtype.kind in "iu" and not np.ma.isMaskedArray(values)
+    if is_whole:  # ns since 1970 have more digits than a float
         seconds = (values.astype(object) - int(values.flat[0])).astype(np.float64) * factor
     else:
         seconds = _numbers(name, values) * factor
@@ -391,6 +391,8 @@ class Log:
         Stretches without gaps, of two rows or more.
     notes : tuple of str
         One sentence for each thing that was done or found.
+    outliers : Counter of str
+        Measurements that were left out as outliers, by state.
 
     Raises
     ------
@@ -402,6 +404,7 @@ class Log:
     inputs: tuple[str, ...]
     pieces: tuple[Piece, ...]
     notes: tuple[str, ...]
+    outliers: Counter[str]
 
     def __init__(
         self,
@@ -424,8 +427,7 @@ class Log:
             if name not in self.states:
                 raise unknown_name("measured state in 'angles' of a log", name, self.states)
         taken = {column for group in named for column in group.values() if column != time}
-        rest = {name: values for name, values in table.items() if name not in taken}
-        clock = clock_column(rest, time, dt, notes)
+        clock = clock_column(table, taken, time, dt, notes)
         unit_of = _units_of(units or {}, named, clock)
         stamps = stamps_of(table, clock, time, dt, unit_of.get(clock or "time", 1.0), notes)
         measured, applied = (
@@ -435,11 +437,12 @@ class Log:
         _note_missing(self.states, measured, notes)
         usable = np.isfinite(stamps) & np.isfinite(applied).all(axis=1)
         rows = _without_gaps(stamps, usable, gap, notes)
+        self.outliers = Counter()
         for i, name in enumerate(self.states):
             if name in angles:
-                _leave_out(name, measured[:, i], rows, TURN, notes)
+                self.outliers[name] += _leave_out(name, measured[:, i], rows, TURN, notes)
                 measured[:, i] = _unwrapped(name, measured[:, i], rows, notes)
-            _leave_out(name, measured[:, i], rows, math.inf, notes)
+            self.outliers[name] += _leave_out(name, measured[:, i], rows, math.inf, notes)
         start = stamps[rows[0][0]]
         if start:
             notes.append(f"Times count from the first usable stamp, {start:.10g} s.")
@@ -510,7 +513,7 @@ class Log:
         """Return the log of pieces that are as :class:`Piece` describes."""
         log = cls.__new__(cls)
         log.states, log.inputs = tuple(states), tuple(inputs)
-        log.pieces, log.notes = tuple(pieces), ()
+        log.pieces, log.notes, log.outliers = tuple(pieces), (), Counter()
         return log
 
     @property
@@ -583,7 +586,9 @@ def _without_gaps(t: Array, usable: Booleans, gap: float | None, notes: list[str
     if again.any():
         notes.append(f"Stamp of the row before repeated, left out: {rows_text(rows[again])}.")
     rows, begins = rows[~again], begins[~again]
-    late = _out_of_order(t[rows], begins)
+    late, stamps = np.zeros(rows.size, np.bool_), t[rows]  # which the next one passes
+    late[1:-1] = (stamps[1:-1] < stamps[:-2]) & (stamps[2:] > stamps[:-2])
+    late[1:-1] &= ~begins[1:-1] & ~begins[2:]
     if late.any():
         notes.append(f"Out of order, left out: {rows_text(rows[late])}.")
     rows, begins = rows[~late], begins[~late]
@@ -614,15 +619,6 @@ def _without_gaps(t: Array, usable: Booleans, gap: float | None, notes: list[str
     if alone:
         notes.append(f"Alone between two gaps, left out: {rows_text(np.concatenate(alone))}.")
     return [piece for piece in pieces if len(piece) > 1]
-
-
-def _out_of_order(t: Array, begins: Booleans) -> Booleans:
-    """Return which rows are earlier than the row before them, behind which the next one goes on."""
-    found = np.zeros(t.size, dtype=np.bool_)
-    if t.size > 2:
-        earlier = (t[1:-1] < t[:-2]) & ~begins[1:-1]
-        found[1:-1] = earlier & (t[2:] > t[:-2]) & ~begins[2:]
-    return found
 
 
 def _unwrapped(name: str, angle: Array, pieces: Rows, notes: list[str]) -> Array:
@@ -676,14 +672,16 @@ def outliers(y: Array, period: float) -> Booleans:
     return np.asarray(apart > np.maximum(usual, across))
 
 
-def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> None:
-    """Write NaN in the place of the outliers of a measured state."""
+def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> int:
+    """Write NaN in the place of the outliers of a measured state, and return their number."""
     there = [each[np.isfinite(y[each])] for each in pieces]
     found = [each[outliers(y[each], period)] for each in there if len(each) >= NEAR]
     rows = np.concatenate([*found, np.empty(0, np.intp)])
-    if 0 < len(rows) <= MOST_OUTLIERS * len(y):
-        notes.append(f"{count_text(len(rows), 'outlier')} of {name} left out, first row {rows[0]}.")
-        y[rows] = np.nan
+    if not 0 < len(rows) <= MOST_OUTLIERS * len(y):
+        return 0
+    notes.append(f"{count_text(len(rows), 'outlier')} of {name} left out, first row {rows[0]}.")
+    y[rows] = np.nan
+    return len(rows)
 
 
 def _note_missing(names: Sequence[str], measured: Array, notes: list[str]) -> None:

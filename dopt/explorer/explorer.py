@@ -33,8 +33,6 @@ from dopt.systems.base import System
 from dopt.systems.plant import Plant
 from dopt.types import Array
 
-# Calls that Ctrl-C does not break off.
-
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
@@ -98,8 +96,8 @@ class Explorer(Explored):
     ``unmoved``
         stretches of 100 learned steps in which no parameter moved
     ``late``
-        stretches of 300 steps whose errors follow from inputs of earlier steps: a delay or a lag
-        that was not declared; not tested where states are measured with noise
+        stretches of 300 steps whose errors, or changes of what is measured with noise, follow from
+        inputs of earlier steps: a delay or a lag that was not declared
     ``worse``
         tests, every 500 steps, in which the learned model predicted the last ones 50 at a time with
         1.25 times the error of the known part alone, or more

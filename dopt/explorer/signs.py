@@ -3,10 +3,11 @@
 Errors are of accelerations, with their signs, by parameters at most 50 steps old. For each learned
 row and each input the share of their squares is taken that the input of the eight steps before
 explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a plant depends
-that answers at once. Estimated states depend on earlier inputs by their filter: of these there is
-no such test.
+that answers at once. Estimated states depend on earlier inputs by their filter: where they are,
+second differences of the measurements take the place of errors, and u_{t-1} is given as well.
 
-Free runs over the last steps are predicted by the learned model, and by the known part alone.
+Free runs over the last steps are predicted by the learned model, and by the known part alone. Where
+a low-pass filter estimates the states, they begin, end and are driven as it has them, late alike.
 """
 
 from __future__ import annotations
@@ -99,17 +100,6 @@ _TEXTS = {
 }
 
 
-class Steps(Protocol):
-    """What is read of the steps of an exploration, in scaled numbers."""
-
-    @property
-    def states(self) -> Array: ...
-    @property
-    def inputs(self) -> Array: ...
-    @property
-    def parameters(self) -> Array: ...
-
-
 class Exploration(Protocol):
     """What is read of a state of an exploration, except for the counts, which are changed."""
 
@@ -120,9 +110,7 @@ class Exploration(Protocol):
     answer: Array | None
     was_asked: bool
     system: System
-
-    @property
-    def steps(self) -> Steps: ...
+    steps: Any  # of the kernel or the reference, in scaled numbers
 
 
 class Signs:
@@ -139,10 +127,10 @@ class Signs:
         self._parameters: Array | None = None  # at the beginning of the block
         self._still = 0  # blocks in a row that left them as they were
         self._start = 0  # first of the steps that followed each other
-        self._steps: list[tuple[int, float]] = []  # the start of each step, and its time
+        self._steps: list[tuple[int, float, Any]] = []  # start, time and measurement of each step
         self._models: list[Array] = []  # parameters at the beginning of each block of them
         self._rows: list[tuple[Array, ...]] = []  # of the next test
-        self._measured: list[Any] = []  # of the last steps, with the start of each
+        self._starts: list[int] = []  # of the last steps
         self._told: set[str] = set()
 
     def restart(self, t: int) -> None:
@@ -158,8 +146,8 @@ class Signs:
             state.counts["beyond"] += 1
             if limits.enforced:
                 self._say("beyond", state.excess[done - 1], done)
-        self._steps.append((self._start, seconds))
-        self._measured.append((self._start, event["learn"]))
+        self._steps.append((self._start, seconds, event["learn"]))
+        self._starts.append(self._start)
         if done % TRIED == 0:
             self._compare_runs(state)
         if done % BLOCK == 0:
@@ -191,35 +179,38 @@ class Signs:
             state.counts["unmoved"] += 1
             self._say("unmoved", learner.name)
         tested = 0 < (state.done - FIRST) % EVERY <= 2 * TESTED
-        if not tested or self._spec.system.n_measured or before is None:
+        if not tested or before is None:
             self._steps = []
             return
         self._models.append(before)
         if len(self._steps) == TESTED:
             self._rows.append(self._new_rows(state))
             self._steps, self._models = [], []
-            if sum(len(errors) for errors, *_ in self._rows) >= TESTED:
+            fewest = TESTED - 2 * bool(self._spec.system.n_measured)
+            if sum(len(errors) for errors, *_ in self._rows) >= fewest:
                 self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
                 self._rows = []
 
     def _compare_runs(self, state: Exploration) -> None:
-        """Count where the learned model predicts the last measurements worse than without it."""
-        found, predicted = scaled(state.system), self._spec.model.predict
-        last, self._measured = self._measured[-RUNS * AHEAD :], []
-        starts, measured = zip(*last, strict=True)
-        first = state.done - len(last)
-        each = range(0, len(last) - AHEAD + 1, AHEAD)
-        at = [t for t in each if starts[t + AHEAD - 1] <= first + t]
+        """Count where the learned model predicts the last states worse than without it."""
+        found, predicted, steps = scaled(state.system), self._spec.model.predict, state.steps
+        starts, self._starts = self._starts[-RUNS * AHEAD :], []
+        first, last = state.done - len(starts), len(starts) - 1
+        each = range(0, last + 2 - AHEAD, AHEAD)
+        at = [t for t in each if starts[min(t + AHEAD, last)] <= first + t]
         if not at:
             return
-        rows = np.array(at)[:, None] + np.arange(AHEAD)
-        x0, u = state.steps.states[first + rows[:, 0]], state.steps.inputs[first + rows]
-        seen = list(found.system.measured_states) or slice(None)
-        ends = found.of_states(np.array(measured), seen)[rows].swapaxes(0, 1)
+        rows = first + np.array(at)[:, None] + np.arange(AHEAD)
+        estimates = self._spec.learner.estimates_states  # with the model
+        seen = (estimates and list(found.system.measured_states)) or slice(None)
+        x0, u = steps.states[rows[:, 0]], steps.inputs[rows]
+        if self._spec.system.n_measured and not estimates:
+            u = steps.trial.state.estimate.inputs[rows]  # of the kernel
+        ends = steps.states[rows + 1][..., seen].swapaxes(0, 1)
 
         def both(x: Array, u: Array) -> Array:  # the learned accelerations, and none
             n = len(x) // 2
-            own = predicted(found.system, state.steps.parameters, x[:n], u[:n])
+            own = predicted(found.system, steps.parameters, x[:n], u[:n])
             return np.concatenate([own, np.zeros_like(own)])
 
         with np.errstate(all="ignore"):
@@ -237,26 +228,39 @@ class Signs:
 
         They are of the last steps, where these follow others without a gap.
         """
-        system, first = scaled(state.system).system, state.done - TESTED
-        predicted = self._spec.model.predict
-        x, u = state.steps.states[first : state.done + 1], state.steps.inputs[first : state.done]
+        found, first, inputs = scaled(state.system), state.done - TESTED, state.steps.inputs
+        system, x, u = found.system, state.steps.states[first : state.done + 1], inputs[first:]
+        starts, seconds, measured = map(np.array, zip(*self._steps, strict=True))
+        differ = 1 if self._spec.system.n_measured else 0
+        if differ:
+            y = found.of_states(measured, list(system.measured_states))
+            slopes = np.diff(y, axis=0, prepend=y[:1]) / seconds[:, None]
+            errors = moved = np.diff(slopes, axis=0, prepend=slopes[:1])
+        else:
+            errors, moved = self._errors(system, x, u[:TESTED], seconds)
+        t = np.arange(first, state.done)
+        t = t[(t - starts >= LAGS + differ) & np.append(starts[1:] == starts[:-1], True)]
+        at = t[t - first >= 2 * differ] - first  # of which there are such differences
+        last = np.stack([u[at - k] for k in range(1 + differ)], axis=-1).reshape(len(at), -1)
+        angles, ones = list(system.angle_indices), np.ones((len(at), 1))
+        turned, others = x[at][:, angles], np.delete(x[at], angles, axis=1)
+        given = np.hstack([ones, others, np.cos(turned), np.sin(turned), last])
+        lags = first + at - differ - np.arange(1, LAGS + 1)[:, None]
+        return errors[at], moved[at], given, np.moveaxis(inputs[lags], 0, -1)
+
+    def _errors(self, system: System, x: Array, u: Array, seconds: Array) -> tuple[Array, Array]:
+        """Return errors of the learned accelerations, and these as they were seen, (N, r)."""
+        rows = list(system.learned_rows)
 
         def accelerations(x: Array, u: Array) -> Array:
             points = (part.reshape(-1, BLOCK, part.shape[1]) for part in (x, u))
             blocks = zip(self._models, *points, strict=True)
-            return np.concatenate([predicted(system, *block) for block in blocks])
+            return np.concatenate([self._spec.model.predict(system, *block) for block in blocks])
 
-        starts, seconds = np.array(self._steps).T
         with np.errstate(all="ignore"):
             moved = (x[1:] - x[:-1]) / seconds[:, None]
             following = predict(system, accelerations, x[:-1], u[:, None])[0]
-            errors = moved - (following - x[:-1]) / system.dt
-        t = np.arange(first, state.done)
-        t = t[(t - starts >= LAGS) & np.append(starts[1:] == starts[:-1], True)]
-        at, rows = t - first, list(system.learned_rows)
-        given = np.hstack([np.ones((len(t), 1)), _features(system, x[at]), u[at]])
-        earlier = np.stack([state.steps.inputs[t - k] for k in range(1, LAGS + 1)], axis=-1)
-        return errors[at][:, rows], moved[at][:, rows], given, earlier
+            return (moved - (following - x[:-1]) / system.dt)[:, rows], moved[:, rows]
 
     def _test(
         self, state: Exploration, errors: Array, moved: Array, given: Array, earlier: Array
@@ -317,10 +321,3 @@ def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array
     found = np.sum((basis.T @ rest) ** 2, axis=0)
     total = np.maximum(np.sum(rest**2, axis=0), np.finfo(float).tiny)
     return found / total, np.sqrt(found / len(errors)), 1 + int(np.argmax(alone))
-
-
-def _features(system: System, states: Array) -> Array:
-    """Return states, (N, d), with the cosine and the sine in the place of each angle."""
-    angles = list(system.angle_indices)
-    turned = states[:, angles]
-    return np.hstack([np.delete(states, angles, axis=1), np.cos(turned), np.sin(turned)])

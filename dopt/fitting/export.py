@@ -42,11 +42,8 @@ def save(found: Any, path: str | Path) -> None:
         known=np.array([plant.known.get(name, "0.0") for name in plant.states]),
         constant_names=np.array([*plant.constants], dtype=str),
         constants=values.constants,
-        learned=s.learned,
-        feature_kinds=s.feature_kinds,
-        feature_indices=s.feature_indices,
-        feature_centers=s.feature_centers,
-        feature_scales=s.feature_scales,
+        **{one: getattr(s, one) for one in ("learned", "feature_kinds", "feature_indices")},
+        **{one: getattr(s, one) for one in ("feature_centers", "feature_scales")},
         W1=W1,
         b1=b1,
         W2=W2,
@@ -191,6 +188,7 @@ FIT_MEASURES = {
     "constant.NAME": "estimate of a constant, or of the delay or the lag [s]",
     "error.NAME": "its standard error",
     "noise.STATE": "standard deviation of what the model leaves, in the unit of the state",
+    "outliers.STATE": "measurements that were left out as outliers",
     "coverage.STATE": "share of held-out measurements within bounds of 90 %",
     "residual.STATE": "correlation of the residuals with the row before",
     "input.STATE": "their largest correlation with an earlier input",
@@ -312,6 +310,7 @@ def _numbers(found: Any, n: int) -> Iterator[Assessment]:
     for name, (value, error) in found.constants.items():
         values |= {f"constant.{name}": value, f"error.{name}": error}
     values |= {f"noise.{name}": value for name, value in found.noise.items()}
+    values |= {f"outliers.{name}": float(count) for name, count in found.selection.outliers.items()}
     values |= {f"coverage.{name}": share for name, share in found.coverage().items()}
     for name, (own, other) in found.whiteness().items():
         values |= {f"residual.{name}": own, f"input.{name}": other}

@@ -22,6 +22,7 @@ import dataclasses
 import itertools
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -153,6 +154,7 @@ def fit(
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
     work.notes += [note for run in runs for note in run.notes if " outlier" in note]
+    work.outliers = sum((run.outliers for run in runs), work.outliers)
     lengths = work.lengths(window)
     work.scan_delay(lengths[0])
     work.choose_window(lengths)
@@ -167,7 +169,8 @@ def fit(
             f"inputs beyond {level:g} act no more than {level:g} does: they count as cut there, as "
             f"by supply={level:g}; declare the supply, also if it is another one"
         )
-        result.selection = result.selection._replace(notes=(note, *result.selection.notes))
+        notes, seconds = (note, *result.selection.notes), work.selection(seed).seconds
+        result.selection = result.selection._replace(notes=notes, seconds=seconds)
         return result
     physics = work.finish(work.model, work.solution, 1.0)
     chosen = work.finish(*network) if network else physics
@@ -196,6 +199,7 @@ class _Selection:
         self.scale = time_scale(data)
         self.table: list[tuple[str, float, float]] = []
         self.notes: list[str] = []
+        self.outliers = Counter[str]()
         self.scan: dict[float, float] = {}
         self.window = math.nan
         self._typical: float | None = None
@@ -211,7 +215,7 @@ class _Selection:
 
     def selection(self, seed: int) -> Selection:
         seconds = time.perf_counter() - self._began
-        told = tuple(self.table), self.window, dict(self.scan), tuple(self.notes)
+        told = tuple(self.table), self.window, dict(self.scan), tuple(self.notes), self.outliers
         return Selection(*told, seed, seconds)
 
     def lengths(self, window: float | None) -> list[float]:
@@ -272,7 +276,6 @@ class _Selection:
         total = int(np.diff(windows.rows, axis=1).sum())
         every = max(1, len(windows.rows) // MOST_SCANNED, total // ROWS_SCANNED)
         some = windows.where(np.arange(len(windows.rows)) % every == 0)
-        fits = {}
         shifts = [shift for shift in SCANNED if self.delay + shift * self.step >= -2.5 * self.step]
 
         def one(shift: int) -> tuple[float, Model, Solution]:
@@ -281,9 +284,8 @@ class _Selection:
             counts = some.counts(self.data)
             return float(np.sqrt(np.median(found.squares / counts))), model, found
 
-        for shift, result in zip(shifts, self._map(one, shifts), strict=True):
-            fits[shift] = result
-            self.scan[self.delay + shift * self.step] = result[0]
+        fits = dict(zip(shifts, self._map(one, shifts), strict=True))
+        self.scan = {self.delay + shift * self.step: fits[shift][0] for shift in shifts}
         best = min(shifts, key=lambda shift: fits[shift][0])
         self.say(f"delay: {best:+d} samples from the guess fit best")
         if isinstance(self.plant.delay, Unknown):
@@ -375,9 +377,9 @@ class _Selection:
         if min(map(cost, CUTS)) > (1.0 - LEAST_FALL) * uncut:
             return None
         best = minimize_scalar(
-            cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options={"xatol": 0.01}
+            cost, bounds=(LOWEST_CUT, 1.0), method="bounded", options={"xatol": 0.001}
         )
-        level, whole = float(f"{best.x * largest:.3g}"), cut_at(best.x)
+        level, whole = float(f"{best.x * largest:.4g}"), cut_at(best.x)
         self.data = self.data._replace(inputs=np.clip(given, -level, level))
         scores, _ = self._validate(model, whole, s)
         self.data = self.data._replace(inputs=given)

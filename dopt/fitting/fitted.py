@@ -63,6 +63,7 @@ class Selection(NamedTuple):
     window: float  # length that was chosen [s]
     delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
+    outliers: Mapping[str, int]  # measurements that were left out, by state
     seed: int  # of the network that was tried
     seconds: float  # wall time of the fit [s]
 
@@ -214,12 +215,11 @@ class Fitted:
         data, z = self._with(run), float(ndtri(0.5 + 0.5 * level))
         model, solution, _, covariance = self.chosen
         simulator, measured = Simulator(model, data), model.structure.measured
-        seconds = 0.5 * self.selection.window if history is None else float(history)
         rng, out = np.random.default_rng(self.selection.seed), []
         values, vectors = np.linalg.eigh(covariance)
         drawn = rng.standard_normal((DRAWN, model.q)) * np.sqrt(np.maximum(values, 0.0))
         changes, others = drawn @ vectors.T, rng.standard_normal((DRAWN, model.d))
-        for first, middle, last in self._whole(data, seconds):
+        for first, middle, last in self._whole(data, history):
             rows = np.array([[first, middle]])
             window = Windows(rows, first_states(data, model, rows))
             window = simulator.settled(solution.p, window)
@@ -445,7 +445,7 @@ class Fitted:
         return trial.trial_key
 
     def save(self, path: str | Path) -> None:
-        """Write the model as arrays (.npz), which NumPy alone reads (:meth:`store`: a database)."""
+        """Write the model as arrays (.npz), which NumPy alone reads; pickle keeps the whole fit."""
         from dopt.fitting.export import save
 
         if "://" in str(path):
@@ -470,9 +470,9 @@ class Fitted:
         log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
         return data_of(self.plant, [log], self.hold, self._deviations)
 
-    def _whole(self, data: Data, history: float) -> Integers:
+    def _whole(self, data: Data, history: float | None) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""
-        out = []
+        out, history = [], 0.5 * self.selection.window if history is None else float(history)
         for first in np.unique(data.firsts):
             last, begin = int(data.lasts[first]), int(first)
             while begin < last and data.time[begin] - data.time[first] < self._latest():
@@ -496,8 +496,7 @@ class Fitted:
     def free_run_error(self, run: Any, *, history: float | None = None) -> dict[str, float]:
         """Return the root mean square error of :meth:`simulate` after the history, by state."""
         data = self._with(run)
-        seconds = 0.5 * self.selection.window if history is None else float(history)
-        rows = self._whole(data, seconds)
+        rows = self._whole(data, history)
         found = predicted(Simulator(self.chosen.model, data), self.chosen.solution.p, rows)
         errors = np.concatenate(found.errors)
         squares = [np.mean(np.square(column[~np.isnan(column)])) for column in errors.T]

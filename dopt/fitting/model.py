@@ -259,6 +259,9 @@ class Model:
         longest_step: float | None = None,
     ) -> None:
         self.plant, self.width, self.delay = plant, width, delay
+        self._made: dict[str, Any] = {"width": width, "layout": layout, "delay": delay}
+        self._made |= {"free_delay": free_delay, "free_lag": free_lag, "seed": seed}
+        self._made["longest_step"] = longest_step
         system = plant.system(1)
         self.d, self.m = len(plant.states), len(plant.inputs)
         known = compiled_known(PlantKey(plant))
@@ -309,17 +312,12 @@ class Model:
 
     def with_network(self, width: int, layout: Layout, seed: int) -> Model:
         """Return the same model with a network beside the known part."""
-        s = self.structure
-        return Model(
-            self.plant,
-            width=width,
-            layout=layout,
-            delay=self.delay,
-            free_delay=s.free_delay,
-            free_lag=s.free_lag,
-            seed=seed,
-            longest_step=s.longest_step,
-        )
+        changed = {"width": width, "layout": layout, "seed": seed}
+        return Model(self.plant, **self._made | changed)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the model is made of, and not what is compiled for it."""
+        return functools.partial(Model, self.plant, **self._made), ()
 
     def extended(self, p: Array, other: Model) -> Array:
         """Return the parameters of another model without a network in the places of this one."""

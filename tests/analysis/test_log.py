@@ -208,6 +208,11 @@ def test_likely_mistakes_of_units_are_said(seed: int) -> None:
         assert "explains nothing" not in text
     for scale, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
         assert f"--units time={unit}" in report({"t": t * scale, "th": angle, "u": u})
+    for name in ("level [cm]", "T_degC"):
+        assert "?" not in report({"t": t, name: np.round(5 * degrees, 1), "u": u})
+    dates = pd.Timestamp("2026-03-01") + pd.to_timedelta(100 * t, "s")
+    for stamps, options in ((dates, {}), (2 * t, {"units": {"t": 60.0}})):
+        assert "stamps in" not in report({"t": stamps, "th": angle, "u": u}, **options)
     clean = report({"t": t, "th": angle, "u": u})
     assert "?" not in clean
     assert f"every {1e3 * DT:.1f} ms" in clean

@@ -306,6 +306,7 @@ def test_a_column_that_a_plant_needs_is_asked_for() -> None:
         ({}, {"units": {"th": "degrees"}}, "counts a turn"),
         ({}, {"units": {"speed": "deg"}}, "column in 'units' of a log 'speed'"),
         ({"time": T}, {}, "t and time are called time"),
+        ({}, {"states": ["th", "t"], "time": None}, "columns t, th, u, of which none is called"),
         ({"th": T[1:]}, {}, r"th \(199,\)"),
         ({"th": ["1,5"] * N}, {}, "'1,5' in row 0.*decimal point"),
         ({"th": ["1.5"] * 9 + ["bad"] * (N - 9)}, {}, "'bad' in row 9"),

@@ -14,13 +14,13 @@ from starlette.testclient import TestClient
 
 import dopt.explorer.explorer as module
 from analysis.serve.app import create_app
-from dopt import Explorer
+from dopt import Explorer, encoder
 from dopt.explorer.signs import SIGNS
 from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.types import Array
 from orchestrate.store import Reader
-from tests.dopt.explorer.plants import MOTOR, content, explorer, following, without_checksums
+from tests.dopt.explorer.plants import MOTOR, Rig, content, explorer, following, without_checksums
 
 STEPS = 800
 
@@ -33,6 +33,15 @@ def drive(one: Explorer, steps: int, delay: int = 0, noise: float = 1e-3) -> Non
         late.append(one.ask(x))
         x = following(x, late.pop(0)) + noise * rng.normal(0.0, [0.1, 1.0])
         one.tell(x)
+
+
+def follow(one: Explorer, rig: Rig, counts: int) -> None:
+    """Let a rig whose angle is measured by an encoder follow the answers, to the last step."""
+    quantum = encoder(counts).quantum
+    y = quantum * np.round(rig.x[:1] / quantum)
+    while one.n_steps < one.spec.system.horizon:
+        y = quantum * np.round(rig.step(one.ask(y))[:1] / quantum)
+        one.tell(y)
 
 
 def signs(one: Explorer) -> dict[str, int]:
@@ -62,6 +71,18 @@ def test_an_undeclared_delay_is_said_in_samples(
     with Explorer(dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random") as one:
         drive(one, STEPS, delay)
         assert one.counts["late"] == 0
+
+
+def test_an_undeclared_delay_is_seen_in_angles_alone() -> None:
+    """Estimates of the rates depend on earlier inputs, also where the delay is right."""
+    learner = {"name": "joint_ekf", "refit_every": 100_000}
+    plant = dataclasses.replace(MOTOR, measured={"angle": encoder(2048)})
+    for integrator, delay, late in (("euler", 0, 0), ("euler", 1, 1), ("rk4", 2, 0), ("rk4", 3, 3)):
+        declared = (delay - late) * MOTOR.dt
+        plant = dataclasses.replace(plant, integrator=integrator, delay=declared)
+        with Explorer(plant, policy="random", learner=learner, steps=STEPS) as one:
+            follow(one, Rig(delay, substeps=4), 2048)
+            assert one.counts["late"] == (2 if late else 0)
 
 
 def test_gaps_are_no_part_of_the_test_for_a_delay() -> None:
@@ -128,6 +149,17 @@ def test_a_model_that_is_worse_than_the_known_part_is_said(
                 one.tell(x)
             assert one.counts["worse"] == (pull == 0.0)
     assert ["times the error of the known part alone" in text for text in said(caplog)] == [True]
+
+
+def test_a_model_of_filtered_states_is_judged_under_filtered_inputs() -> None:
+    """From true states the models have 5.9 and 0.3 times the error of the known part."""
+    known = {"angle": "rate", "rate": "gain * voltage - 8 * sin(angle) - 0.5 * rate"}
+    plant = dataclasses.replace(MOTOR, known=known, velocity_cutoff=5.0)
+    for counts, learner, seed, worse in ((250, "gauss_newton", 0, 1), (500, "adam_window", 1, 0)):
+        plant = dataclasses.replace(plant, measured={"angle": encoder(counts)})
+        with Explorer(plant, learner=learner, steps=500, seed=seed) as one:
+            follow(one, Rig(substeps=4), counts)
+            assert one.counts["worse"] == worse
 
 
 def test_states_in_a_small_part_of_the_box_are_said(caplog: pytest.LogCaptureFixture) -> None:

@@ -115,6 +115,17 @@ def test_a_fit_with_a_network_has_its_seed_and_one_without_has_none(url: str) ->
     assert sorted(rows(url, "SELECT seed FROM trial")) == [(0,), (5,), (6,)]
 
 
+def test_measurements_that_were_left_out_are_stored_and_saved(url: str, tmp_path: Any) -> None:
+    table = run(0, ROWS)
+    table.loc[[60, 61, 200], "angle"] += 9.0
+    found = dopt.fit(declared(), [table, run(1, ROWS)], width=0, window=0.3)
+    found.store(url)
+    [(value,)] = rows(url, "SELECT value FROM v_assessment WHERE measure = 'outliers.angle'")
+    assert value == 3.0
+    found.save(tmp_path / "model.npz")
+    assert "3 outliers of angle left out" in str(np.load(tmp_path / "model.npz")["report"])
+
+
 def test_pages_commands_and_merges_know_it(
     url: str, found: Fitted, tmp_path: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
