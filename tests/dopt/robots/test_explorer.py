@@ -184,9 +184,8 @@ def test_joints_that_never_move_are_named(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_frame_without_mass_can_be_the_last_body() -> None:
-    """Once less than nothing on it made its centre infinite, and torques NaN."""
     known = wrist(0.0033, 1.0)[1].known
-    known.hang(0.0, np.ones(3))
+    known.hang(0.0, np.ones(3))  # once that made torques NaN
     np.testing.assert_allclose(known.inverse(*np.zeros((2, 1)), np.ones(1)), 0.0033)
 
 
