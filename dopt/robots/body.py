@@ -348,6 +348,8 @@ class KnownBody:
         model, last = self.model, self.body.moved[-1]
         own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
         total = own + mass
+        if total <= 0.0:  # of a frame without mass, from which none can be taken
+            return
         model.body_mass[last] = total
         model.body_ipos[last] = (own * centre + moment) / total
         if mass > 0.0:
@@ -579,7 +581,7 @@ def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
     bent = getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1))).any(axis=1)
     carried = [j for j in ids if model.jnt_actgravcomp.any() > model.jnt_actgravcomp[j]]
     left = (
-        ("joints that stay in their place", kinds.mjOBJ_JOINT, {*range(model.njnt)} - {*ids}),
+        ("joints taken to stay in their place", kinds.mjOBJ_JOINT, {*range(model.njnt)} - {*ids}),
         (
             "actuators that move no hinge or slide alone",
             kinds.mjOBJ_ACTUATOR,

@@ -209,8 +209,8 @@ class Problem:
         return f"the bodies {touching[0][1]} and {touching[0][2]} touch" if touching else ""
 
     def checked(self, one: Candidate) -> Candidate:
-        """Return a candidate, broken if something stands against it at finer steps."""
-        return dataclasses.replace(one, broken=1.0) if self.obstacle(one) else one
+        """Return a candidate, broken only if something stands against it at finer steps."""
+        return dataclasses.replace(one, broken=float(bool(self.obstacle(one))))
 
 
 def _friction(body: Body, limits: Limits) -> tuple[Array, Array]:

@@ -46,11 +46,14 @@ First by a period of this part of the torque limit, then by what was seen, which
 seconds; it counts so many times.
 """
 
-SLIP, EASED = 0.2, 0.15
-"""Part of the velocity limit by which a joint that breaks loose is ahead of its reference.
+SLIP = 0.02, 0.2
+"""Parts of the velocity limit by which a joint that breaks loose is ahead of its reference.
 
-Of the error that pushed it, a part is forgotten each period.
+From the first on, a part of the error that pushed it is forgotten, at the second the whole.
 """
+
+STILL = 10.0
+"""Seconds after which joints that have not moved are named."""
 
 CREEP = 0.1
 """Part of the velocity limit that references may always take."""
@@ -332,7 +335,9 @@ class RobotExplorer:
     def _pace(self) -> None:
         """Leave room between references and limits of velocity for rates that run ahead."""
         ahead = (np.abs(self._tracker.v) - np.abs(self._v)) / self.limits.velocity
-        self._q = np.where(ahead > SLIP, self._q + EASED * (self._tracker.q - self._q), self._q)
+        error = self._q - self._tracker.q
+        forgotten = np.clip((ahead - SLIP[0]) / (SLIP[1] - SLIP[0]), 0.0, 1.0)
+        self._q = self._q - np.where(error * self._tracker.v > 0.0, forgotten * error, 0.0)
         self._ahead = np.maximum(ahead, self._ahead * math.exp(-self.dt / FADED))
         self._fastest = self.limits.velocity * np.maximum(1.0 - AHEAD * self._ahead, CREEP)
 
@@ -433,6 +438,12 @@ class RobotExplorer:
         rates = np.array([row[2] for row in self._rows]) if self.inputs == "references" else None
         means = self.learner.window.means(positions, torques)
         self.counts["windows"] += 1
+        still = [self.body.joints[j] for j in np.flatnonzero(self.learner.windows == 0)]
+        if still and self.counts["windows"] == math.ceil(STILL / self.learner.window.seconds):
+            self._say(
+                f"{listed(still)} did not move fast enough to learn from in {STILL:g} s: give the "
+                f"armature in the robot's file, or look whether something holds it"
+            )
         if self._payload is not None:
             self._payload.append((means, rates))
             if len(self._payload) >= max(2 * RECENT, LIFTED / self.learner.window.seconds):

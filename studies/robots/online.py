@@ -26,7 +26,7 @@ from dopt.robots.explorer import RobotExplorer
 from dopt.robots.friction import SPEEDS, FrictionLearner
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Tracker, possible_acceleration
-from dopt.robots.trajectories import Family, Fourier, Ladder, Multisine
+from dopt.robots.trajectories import Fourier, Ladder, Multisine
 from dopt.robots.windows import window_size
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, LIMITS, SimulatedRobot, iiwa, jaco
@@ -132,8 +132,6 @@ def track(robot: SimulatedRobot, motion: Motion, learner: FrictionLearner) -> Tr
 
     The robot is placed where the motion begins.
     """
-    if abs(motion.dt - CONTROL) > 1e-9:
-        motion = resampled(motion)
     known, trace = KnownBody(robot.body), Trace()
     tracker = Tracker(known, robot.limits, learner.feedforward, CONTROL)
     robot.place(motion.positions[0])
@@ -159,17 +157,6 @@ def track(robot: SimulatedRobot, motion: Motion, learner: FrictionLearner) -> Tr
         if k % LOOK == LOOK - 1:
             trace.look(robot, learner)
     return trace
-
-
-def resampled(motion: Motion) -> Motion:
-    """Return a motion at 500 Hz, by linear interpolation of its rows."""
-    times = np.arange(0.0, motion.times[-1], CONTROL)
-
-    def at(rows: Array) -> Array:
-        return np.column_stack([np.interp(times, motion.times, row) for row in rows.T])
-
-    parts = (motion.positions, motion.velocities, motion.accelerations)
-    return Motion(CONTROL, *(at(part) for part in parts))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,18 +219,12 @@ def _designs(body: Body, limits: Limits, seconds: float) -> Iterator[tuple[str, 
     problem = Problem(body, limits, "damping,frictionloss", seconds, nuisance="")
     random = np.random.default_rng(0)
     yield "multisine, best of 25", multisine_of(problem, random).motion(CONTROL)
-    periods = (2.0, 5.0, 10.0)
-    families: list[Family] = [Fourier(limits, seconds, period) for period in periods]
-    for family in families:
+    for family in [Fourier(limits, seconds, period) for period in (2.0, 5.0, 10.0)]:
         yield family.name, searched(problem, family, random, EFFORT).motion(CONTROL)
     ladder = Ladder(limits, seconds)
     plain = random.standard_normal((10, ladder.size))
-    yield (
-        "ladder, best of 10",
-        min((problem.candidate(ladder, x) for x in plain), key=lambda one: one.score).motion(
-            CONTROL
-        ),
-    )
+    best = min((problem.candidate(ladder, x) for x in plain), key=lambda one: one.score)
+    yield "ladder, best of 10", best.motion(CONTROL)
     yield "D-optimal ladder", searched(problem, ladder, random, EFFORT).motion(CONTROL)
 
 

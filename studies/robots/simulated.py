@@ -190,11 +190,6 @@ class SimulatedRobot:
         model.body_inertia[last] += mass * (1 - share) * 0.08**2 + 0.4 * mass * 0.04**2
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
-    def true_friction(self, joint: int, velocities: Array) -> Array:
-        """Return the friction torque [N m] of a joint at velocities, (k,)."""
-        every = np.repeat(np.asarray(velocities, float)[:, None], self.body.n, axis=1)
-        return self.friction.torques(every)[:, joint]
-
 
 LIMITS = Path(__file__).with_name("iiwa.yaml")
 

@@ -100,7 +100,7 @@ def inverse(body: Body, motion: Motion, model: object = None) -> np.ndarray:
 def test_torques_are_those_of_the_engine(arm: Body) -> None:
     assert arm.joints == ("turn", "slide", "lift", "roll")
     assert arm.bodies == ("base", "link", "hand")
-    assert arm.notes == ("left out: joints that stay in their place: joint4 (free)",)
+    assert arm.notes == ("left out: joints taken to stay in their place: joint4 (free)",)
     for body in (arm, jaco()):
         damping = body.model.dof_damping.copy()
         motion = random_motion(body.n)
@@ -492,7 +492,7 @@ def test_what_is_left_out_is_named() -> None:
     )
     assert body.joints == ("a",)
     assert body.notes == (
-        "left out: joints that stay in their place: root (free), b, c",
+        "left out: joints taken to stay in their place: root (free), b, c",
         "left out: actuators that move no hinge or slide alone: pull",
         "left out: equality constraints: mimic",
         "left out: dry friction of tendons: rope",
@@ -511,7 +511,7 @@ def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:
     )
     body = Body.load(tmp_path / "gripper.urdf")
     assert body.joints == ("left",)
-    assert body.notes[0] == "left out: joints that stay in their place: right"
+    assert body.notes[0] == "left out: joints taken to stay in their place: right"
     limits = Limits.of(body)
     assert (limits.torque, limits.velocity) == ([20.0], [0.2])
     text = (tmp_path / "gripper.urdf").read_text()

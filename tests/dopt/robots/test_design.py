@@ -265,6 +265,8 @@ def test_what_stands_against_every_motion_is_named(tmp_path: Path) -> None:
         SpecificationError, match=r"in the best one, joint 'z' takes [0-9.]+ of 70 N\)"
     ):
         Design.of(problem, effort=24)
+    near = dataclasses.replace(limits, torque=np.array([94.0]))  # once refused, for no reason
+    assert Design.of(Problem(body, near, "damping", 3.0, nuisance=""), effort=24).best.free
     fold = body_of(FOLD)
     given = "joints: {hinge: {position: [1.0, 1.5], velocity: 1, torque: 70}}"
     problem = Problem(fold, limits_of(fold, tmp_path, given), "damping", 3.0)
