@@ -81,7 +81,7 @@ def _once(found: list[Command]) -> list[Command]:
 
 
 ACCEPTED = [command for command in _once(commands("launch.py")) if command.page != TUTORIAL]
-"""Commands of launches, without those of the tutorial, which is run from its first to its last."""
+"""Commands of launches outside the tutorial, which is run from its first to its last."""
 
 
 @pytest.mark.parametrize("command", ACCEPTED, ids=str)

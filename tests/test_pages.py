@@ -76,7 +76,7 @@ def test_a_changed_number_is_noticed_and_written(
     pictures = shutil.ignore_patterns("vendor", "*.png", "*.gif")
     shutil.copytree(ROOT / "docs", copied, ignore=pictures)
     made, summary = tables(copied), copied / "summary.csv"
-    made.PAGES = ("../README.md",)  # type: ignore[attr-defined]
+    made.PAGES = ("../README.md",)  # type: ignore[attr-defined]  # a module found by its path
     first = summary.read_text().splitlines()[1].split(",")[3]
     summary.write_text(summary.read_text().replace(first, "7.5"))
     assert made.main(check=True) == 1

@@ -222,7 +222,7 @@ class Shaken(PointEnv):
     """Has noise of a generator that its seed does not reach."""
 
     def step(self, action: Any) -> Any:
-        self.speed = self.speed + 0.01 * np.random.standard_normal()  # noqa: NPY002
+        self.speed = self.speed + 0.01 * np.random.standard_normal()  # noqa: NPY002  # an unseeded draw is the fault
         return super().step(action)
 
 

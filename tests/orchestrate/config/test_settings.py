@@ -254,7 +254,7 @@ hydra:
   sweeper:
     grids: [{policy: beyond/task, policy.goal: [1, 0.5], policy.count: 3, seed: 7}]
 """
-"""Values of a grid are those of YAML."""
+"""A grid has the values of YAML."""
 
 
 @pytest.mark.parametrize(
@@ -271,7 +271,7 @@ hydra:
 def test_an_experiment_can_be_several_grids(
     command_line: CommandLine, tmp_path: Path, words: str, code: int, said: str
 ) -> None:
-    """What is said of a setting does not count the grids that never asked for it."""
+    """A setting counts no grid that never asked for it."""
     folder = tmp_path / "settings/experiment"
     folder.mkdir(parents=True)
     (folder / "several.yaml").write_text(SEVERAL)
