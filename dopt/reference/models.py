@@ -554,17 +554,27 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     A problem that is not finite has none: its input is NaN, and the trial diverges.
     """
     Q, v = problem
+    if len(v) == 1:
+        Q_0, v_0, tie = (one[0].numpy(force=True) for one in (Q, v, ties))
+        return v.new_tensor(_input_of_one(Q_0, v_0, tie, gamma))[None]
     finite = torch.cat([Q, v.unsqueeze(-1)], dim=-1).isfinite().all(-1).all(-1, keepdim=True)
     if v.shape[1] == 1:
         up = (v < 0) | ((v == 0) & (ties > 0))
         chosen = torch.where(up, gamma, -gamma).to(v)
-    elif len(v) == 1:
-        of_one = [one[0].numpy(force=True) for one in (Q, v, ties)]
-        return v.new_tensor(sphere_maximizer(of_one[0], of_one[1], gamma, of_one[2]))[None]
     else:
         Q, v = torch.where(finite.unsqueeze(-1), Q, 0.0), torch.where(finite, v, 0.0)
         chosen = maximize_on_spheres(Q, v, gamma, ties)
     return torch.where(finite, chosen, torch.nan)
+
+
+def _input_of_one(Q: Array, v: Array, tie: Array, gamma: float) -> Array:
+    """Return the maximiser, (m,), of one trial, in numpy."""
+    if not (np.isfinite(Q).all() and np.isfinite(v).all()):
+        return np.full_like(v, np.nan)
+    if len(v) == 1:
+        up = v[0] < 0 or (v[0] == 0 and tie[0] > 0)
+        return np.array([gamma if up else -gamma])
+    return sphere_maximizer(Q, v, gamma, tie)
 
 
 def uniform_inputs(
