@@ -100,6 +100,19 @@ _TEXTS = {
 }
 
 
+class Steps(Protocol):
+    """What is read of the steps of an exploration, in scaled numbers."""
+
+    @property
+    def states(self) -> Array: ...
+    @property
+    def inputs(self) -> Array: ...
+    @property
+    def learned_inputs(self) -> Array: ...
+    @property
+    def parameters(self) -> Array: ...
+
+
 class Exploration(Protocol):
     """What is read of a state of an exploration, except for the counts, which are changed."""
 
@@ -110,7 +123,9 @@ class Exploration(Protocol):
     answer: Array | None
     was_asked: bool
     system: System
-    steps: Any  # of the kernel or the reference, in scaled numbers
+
+    @property
+    def steps(self) -> Steps: ...
 
 
 class Signs:
@@ -205,7 +220,7 @@ class Signs:
         seen = (estimates and list(found.system.measured_states)) or slice(None)
         x0, u = steps.states[rows[:, 0]], steps.inputs[rows]
         if self._spec.system.n_measured and not estimates:
-            u = steps.trial.state.estimate.inputs[rows]  # of the kernel
+            u = steps.learned_inputs[rows]
         ends = steps.states[rows + 1][..., seen].swapaxes(0, 1)
 
         def both(x: Array, u: Array) -> Array:  # the learned accelerations, and none

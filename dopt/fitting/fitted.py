@@ -472,7 +472,8 @@ class Fitted:
 
     def _whole(self, data: Data, history: float | None) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""
-        out, history = [], 0.5 * self.selection.window if history is None else float(history)
+        out = []
+        history = 0.5 * self.selection.window if history is None else float(history)
         for first in np.unique(data.firsts):
             last, begin = int(data.lasts[first]), int(first)
             while begin < last and data.time[begin] - data.time[first] < self._latest():

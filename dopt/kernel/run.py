@@ -309,6 +309,11 @@ class KernelSteps(KernelState):
         return self.record.inputs
 
     @property
+    def learned_inputs(self) -> Array:
+        """Inputs beside the states that are learned from, late as a filter of these, (T, m)."""
+        return self.state.estimate.inputs
+
+    @property
     def errors(self) -> Array:
         """Errors of the accelerations before they were learned, (T,)."""
         return self.record.loss

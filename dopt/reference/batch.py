@@ -506,6 +506,11 @@ class ReferenceSteps:
         """Parameters of the model, (q,)."""
         return self._batch.theta[0].numpy().copy()
 
+    @property
+    def learned_inputs(self) -> Array:
+        """Inputs beside the states that are learned from, (T, m): none is filtered here."""
+        return self.inputs
+
     def begin(self, t: int, state: Array) -> None:
         """Let step t begin at a state, (d,), whatever came before it."""
         self.states[t] = state

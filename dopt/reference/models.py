@@ -120,7 +120,7 @@ class NetworkFunction:
         self._over_trials, self._over_both = vmap(self._network), vmap(self._one_by_one)
 
     def __call__(self, theta: Tensor, x: Tensor) -> Tensor:
-        (n, points) = len(theta), x.shape[1]
+        n, points = len(theta), x.shape[1]
         if n > 1:
             phi = features(self._system, x).expand(n, -1, -1)
             many = self._over_both if points > 1 else self._over_trials
