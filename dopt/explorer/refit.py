@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from array import array
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -51,7 +52,7 @@ class Recording:
     """
 
     def __init__(self) -> None:
-        self._pieces: list[tuple[list[float], list[Any], list[Any]]] = []
+        self._pieces: list[tuple[array[float], array[float], array[float]]] = []  # row by row
         self._ended = True
         self.rows = self.fitted = 0
 
@@ -60,12 +61,12 @@ class Recording:
         if "learn" in event:
             assert present is not None
             if self._ended:
-                self._pieces.append(([0.0], [present.tolist()], []))
+                self._pieces.append((array("d", [0.0]), array("d", present), array("d")))
                 self._ended = False
             times, measured, inputs = self._pieces[-1]
             times.append(times[-1] + event["dt"])
-            measured.append(event["learn"])
-            inputs.append(event["applied"])
+            measured.extend(event["learn"])
+            inputs.extend(event["applied"])
             self.rows += 1
         elif "begin" in event:
             again = present is not None and event["begin"] == present.tolist()
@@ -86,14 +87,12 @@ class Recording:
                 "nothing was learned yet, but a log has two rows or more: ask() and tell() first."
             )
         states = [name for name in plant.states if name in plant.measured] or [*plant.states]
-        return Log.of_pieces(
-            states,
-            [*plant.inputs],
-            [
-                Piece(np.array(time), np.array(measured), np.array([*inputs, inputs[-1]]))
-                for time, measured, inputs in self._pieces
-            ],
-        )
+        pieces = []
+        for time, measured, inputs in self._pieces:
+            rows, held = len(time), inputs[-len(plant.inputs) :]
+            y, u = (np.array(part).reshape(rows, -1) for part in (measured, inputs + held))
+            pieces.append(Piece(np.array(time), y, u))
+        return Log.of_pieces(states, [*plant.inputs], pieces)
 
 
 class Found(NamedTuple):

@@ -8,12 +8,17 @@ second differences of the measurements take the place of errors, and u_{t-1} is 
 
 Free runs over the last steps are predicted by the learned model, and by the known part alone. Where
 a low-pass filter estimates the states, they begin, end and are driven as it has them, late alike.
+
+Tests take as long as several steps of a plant. A part of one is done after each learned step, with
+the model and the states as they were when it began, and what is left after the last step of all.
 """
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -45,9 +50,12 @@ STORED = {name: said for name, said in SIGNS.items() if name != "beyond"}
 BLOCK = 50
 """Steps after which parameters are compared; one set of parameters predicts so many."""
 
+PART = 10
+"""Steps whose errors are taken together, after one learned step."""
+
 FIRST, TESTED, EVERY = 200, 300, 3000
 """Steps before tests for earlier inputs, while much is left to learn; fewest of a test; and steps
-from two tests, which take 2 ms each, to the next two."""
+from two tests to the next two."""
 
 LAGS = 8
 """Longest lag that is tested, in steps; tested steps follow so many others without a gap."""
@@ -146,6 +154,7 @@ class Signs:
         self._models: list[Array] = []  # parameters at the beginning of each block of them
         self._rows: list[tuple[Array, ...]] = []  # of the next test
         self._starts: list[int] = []  # of the last steps
+        self._tests: deque[Iterator[None]] = deque()  # that are not done, part by part
         self._told: set[str] = set()
 
     def restart(self, t: int) -> None:
@@ -163,12 +172,18 @@ class Signs:
                 self._say("beyond", state.excess[done - 1], done)
         self._steps.append((self._start, seconds, event["learn"]))
         self._starts.append(self._start)
-        if done % TRIED == 0:
-            self._compare_runs(state)
         if done % BLOCK == 0:
             self._end_block(state)
+        if done % TRIED == 0:
+            self._begin(self._compare_runs(state))
         if done == AFTER:
             self._measure_box(state)
+        while self._tests:
+            has_ended = next(self._tests[0], True)
+            if has_ended:
+                self._tests.popleft()
+            if done < self._spec.system.horizon:
+                break
 
     def find_supply(self, state: Exploration, level: float) -> None:
         """Count a fit that found a supply which the plant does not declare."""
@@ -199,14 +214,15 @@ class Signs:
             return
         self._models.append(before)
         if len(self._steps) == TESTED:
-            self._rows.append(self._new_rows(state))
+            self._begin(self._test_inputs(state, self._steps, self._models))
             self._steps, self._models = [], []
-            fewest = TESTED - 2 * bool(self._spec.system.n_measured)
-            if sum(len(errors) for errors, *_ in self._rows) >= fewest:
-                self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
-                self._rows = []
 
-    def _compare_runs(self, state: Exploration) -> None:
+    def _begin(self, test: Iterator[None]) -> None:
+        """Let a test take what it needs of the exploration as it is now."""
+        if next(test, True) is None:
+            self._tests.append(test)
+
+    def _compare_runs(self, state: Exploration) -> Iterator[None]:
         """Count where the learned model predicts the last states worse than without it."""
         found, predicted, steps = scaled(state.system), self._spec.model.predict, state.steps
         starts, self._starts = self._starts[-RUNS * AHEAD :], []
@@ -222,14 +238,19 @@ class Signs:
         if self._spec.system.n_measured and not estimates:
             u = steps.learned_inputs[rows]
         ends = steps.states[rows + 1][..., seen].swapaxes(0, 1)
+        parameters = np.array(steps.parameters)
 
         def both(x: Array, u: Array) -> Array:  # the learned accelerations, and none
             n = len(x) // 2
-            own = predicted(found.system, steps.parameters, x[:n], u[:n])
+            own = predicted(found.system, parameters, x[:n], u[:n])
             return np.concatenate([own, np.zeros_like(own)])
 
-        with np.errstate(all="ignore"):
-            reached = predict(found.system, both, np.tile(x0, (2, 1)), np.tile(u, (2, 1, 1)))
+        reached, x = np.empty((AHEAD, 2 * len(at), x0.shape[1])), np.tile(x0, (2, 1))
+        for k in range(AHEAD):
+            yield
+            held = np.tile(u[:, k : k + 1], (2, 1, 1))
+            with np.errstate(all="ignore"):
+                reached[k] = x = predict(found.system, both, x, held)[0]
         learned, known = (
             relative_error(half[..., seen], ends, x0[:, seen])
             for half in np.split(reached, 2, axis=1)
@@ -238,44 +259,51 @@ class Signs:
             state.counts["worse"] += 1
             self._say("worse", AHEAD, learned / known)
 
-    def _new_rows(self, state: Exploration) -> tuple[Array, ...]:
-        """Return errors (N, r), accelerations (N, r), what is given (N, p) and inputs (N, m, L).
+    def _test_inputs(
+        self, state: Exploration, steps: list[tuple[int, float, Any]], models: list[Array]
+    ) -> Iterator[None]:
+        """Count where inputs of earlier steps explain errors, once there are enough of these.
 
-        They are of the last steps, where these follow others without a gap.
+        What is given (N, p) and the earlier inputs (N, m, L) are taken beside the errors (N, r) and
+        the accelerations (N, r) of the last steps, where these follow others without a gap.
         """
         found, first, inputs = scaled(state.system), state.done - TESTED, state.steps.inputs
-        system, x, u = found.system, state.steps.states[first : state.done + 1], inputs[first:]
-        starts, seconds, measured = map(np.array, zip(*self._steps, strict=True))
+        x, u = state.steps.states[first : state.done + 1].copy(), inputs[first:]
+        system = found.system
+        starts, seconds, measured = map(np.array, zip(*steps, strict=True))
         differ = 1 if self._spec.system.n_measured else 0
         if differ:
             y = found.of_states(measured, list(system.measured_states))
             slopes = np.diff(y, axis=0, prepend=y[:1]) / seconds[:, None]
             errors = moved = np.diff(slopes, axis=0, prepend=slopes[:1])
         else:
-            errors, moved = self._errors(system, x, u[:TESTED], seconds)
-        t = np.arange(first, state.done)
+            moved = ((x[1:] - x[:-1]) / seconds[:, None])[:, list(system.learned_rows)]
+            errors = np.empty_like(moved)
+            for k in range(0, TESTED, PART):
+                at = slice(k, k + PART)
+                yield
+                errors[at] = moved[at] - self._flow(system, models[k // BLOCK], x[at], u[at])
+        t = np.arange(first, first + TESTED)
         t = t[(t - starts >= LAGS + differ) & np.append(starts[1:] == starts[:-1], True)]
         at = t[t - first >= 2 * differ] - first  # of which there are such differences
-        last = np.stack([u[at - k] for k in range(1 + differ)], axis=-1).reshape(len(at), -1)
+        last = np.hstack([u[at - k] for k in range(1 + differ)])
         angles, ones = list(system.angle_indices), np.ones((len(at), 1))
         turned, others = x[at][:, angles], np.delete(x[at], angles, axis=1)
         given = np.hstack([ones, others, np.cos(turned), np.sin(turned), last])
         lags = first + at - differ - np.arange(1, LAGS + 1)[:, None]
-        return errors[at], moved[at], given, np.moveaxis(inputs[lags], 0, -1)
+        self._rows.append((errors[at], moved[at], given, np.moveaxis(inputs[lags], 0, -1)))
+        if sum(len(errors) for errors, *_ in self._rows) >= TESTED - 2 * differ:
+            yield
+            self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
+            self._rows = []
 
-    def _errors(self, system: System, x: Array, u: Array, seconds: Array) -> tuple[Array, Array]:
-        """Return errors of the learned accelerations, and these as they were seen, (N, r)."""
-        rows = list(system.learned_rows)
-
-        def accelerations(x: Array, u: Array) -> Array:
-            points = (part.reshape(-1, BLOCK, part.shape[1]) for part in (x, u))
-            blocks = zip(self._models, *points, strict=True)
-            return np.concatenate([self._spec.model.predict(system, *block) for block in blocks])
-
+    def _flow(self, system: System, parameters: Array, x: Array, u: Array) -> Array:
+        """Return the mean accelerations of a predicted step, (n, r)."""
+        accelerations = functools.partial(self._spec.model.predict, system, parameters)
         with np.errstate(all="ignore"):
-            moved = (x[1:] - x[:-1]) / seconds[:, None]
-            following = predict(system, accelerations, x[:-1], u[:, None])[0]
-            return (moved - (following - x[:-1]) / system.dt)[:, rows], moved[:, rows]
+            following = predict(system, accelerations, x, u[:, None])[0]
+            flow: Array = (following - x) / system.dt
+            return flow[:, list(system.learned_rows)]
 
     def _test(
         self, state: Exploration, errors: Array, moved: Array, given: Array, earlier: Array

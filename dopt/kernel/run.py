@@ -246,8 +246,9 @@ class KernelState:
     @functools.cached_property
     def held(self) -> HeldTrial:
         """The trial as compiled code holds it."""
-        spec, others = self.spec, self.also_called
-        others = (*others, *BETWEEN) if NumpyParts.needed_by(spec.config) else others
+        spec = self.spec
+        between = BETWEEN if NumpyParts.needed_by(spec.config) else ()
+        others = (*self.also_called, *between)
         parts = spec.policy, spec.learner, self.trial
         steps, code = compiled_trial(*parts, self.callers, self.points, others)
         self._code |= zip(self.callers, code, strict=True)
@@ -256,10 +257,13 @@ class KernelState:
 
     def call(self, function: CompiledFunction, *given: object) -> Any:
         """Call a function of :mod:`dopt.kernel.loop`, which is compiled when it is first called."""
-        held = self.held
         if function not in self._code:
-            self._code[function] = compiled_step(self.trial, function, self.points)
-        return self._code[function](held, *given)
+            self._load(function)
+        return self._code[function](self.held, *given)
+
+    def _load(self, function: CompiledFunction) -> None:
+        _ = self.held  # which compiles what the cache lacks, all at once
+        self._code[function] = compiled_step(self.trial, function, self.points)
 
     def _check_inputs(self, first: int, last: int) -> None:
         """Refuse inputs larger than γ from a compiled policy in a user's file."""
@@ -290,13 +294,16 @@ class KernelSteps(KernelState):
     """
 
     callers = STEPS
+    also_called: ClassVar[tuple[CompiledFunction, ...]] = (loop.write_reached,)
 
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
         if spec.system.n_measured:
             self.trial.sensors.start_variances[:] = start_variances(spec.system)
         self._parts = NumpyParts(self) if NumpyParts.needed_by(spec.config) else None
-        _ = self.held  # before the first step, which waits for nothing then
+        taken = (loop.observe_next, loop.learn_next) if self._parts else ()
+        for function in (*taken, *self.also_called):  # no step waits for its code then
+            self._load(function)
 
     @property
     def states(self) -> Array:
@@ -377,16 +384,18 @@ def is_stepped(config: TrialConfig) -> bool:
 class SteppedTrial(KernelSteps):
     """A trial in steps, with the attributes of :class:`dopt.kernel.run.KernelTrial`."""
 
-    points: Evaluation
     also_called = (loop.evaluate_next,)
 
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
-        self.points = points_of_trial(shared_points(spec.config), self.trial.network)
         self._episode = None
         if isinstance(spec.system, BlackBox):
             self._episode = spec.system.episode(episode_seed(spec.seed))
             self.begin(0, self._episode.state)
+
+    @functools.cached_property
+    def points(self) -> Evaluation:  # type: ignore[override]  # which a trial has, other steps not
+        return points_of_trial(shared_points(self.spec.config), self.trial.network)
 
     @property
     def feedback(self) -> Feedback | None:

@@ -20,6 +20,7 @@ from dopt.errors import IncompatibleError, SpecificationError
 from dopt.explorer.refit import FitBeside, Found
 from dopt.explorer.state import InFlight
 from dopt.fitting.model import Layout, Model
+from dopt.kernel import run
 from dopt.spec.scaled import learned_accelerations, scaled
 from dopt.systems.plant import ExploredPlant
 from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, Rig, motor_acceleration
@@ -210,6 +211,16 @@ def test_a_state_that_is_not_measured_is_left_to_the_fit() -> None:
             one.tell(rig.x[:1], time=rig.time)
         assert one.counts["refits"] >= 1
         assert one.constants["gain"] == pytest.approx(5.0, rel=0.2)
+
+
+@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton", "simulation_error"])
+def test_no_step_waits_for_its_code(monkeypatch: pytest.MonkeyPatch, learner: str) -> None:
+    """What steps, plans for a late plant and updates in numpy call is loaded before the first."""
+    plant = dataclasses.replace(MOTOR, delay=1.5 * DT)
+    with Explorer(plant, policy="random", learner=learner, steps=20) as one:
+        monkeypatch.setattr(run, "compiled_step", None)
+        drive(one, late_rig(), 20)
+        assert one.n_steps == 20
 
 
 def test_with_a_deadline_no_fit_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

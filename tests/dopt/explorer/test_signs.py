@@ -13,8 +13,10 @@ import pytest
 from starlette.testclient import TestClient
 
 import dopt.explorer.explorer as module
+import dopt.explorer.signs as signs_module
 from analysis.serve.app import create_app
 from dopt import Explorer, encoder
+from dopt.control import planning
 from dopt.explorer.signs import SIGNS
 from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
@@ -83,6 +85,35 @@ def test_an_undeclared_delay_is_seen_in_angles_alone() -> None:
         with Explorer(plant, policy="random", learner=learner, steps=STEPS) as one:
             follow(one, Rig(delay, substeps=4), 2048)
             assert one.counts["late"] == (2 if late else 0)
+
+
+@pytest.mark.parametrize("horizon", [STEPS, 2 * STEPS])
+def test_a_step_does_a_small_part_of_a_test(monkeypatch: pytest.MonkeyPatch, horizon: int) -> None:
+    """A plant does not wait for it, unless it is the last step."""
+    predicted: list[int] = []
+
+    def predict(system: Any, accelerations: Any, states: Array, inputs: Array) -> Array:
+        predicted.append(inputs.shape[0] * inputs.shape[1])
+        return planning.predict(system, accelerations, states, inputs)
+
+    monkeypatch.setattr(signs_module, "predict", predict)
+    each, x = [], np.array([0.1, 0.0])
+    with explorer(steps=horizon) as one:
+        for _ in range(STEPS):
+            predicted.clear()
+            x = following(x, one.ask(x))
+            one.tell(x)
+            each.append(sum(predicted))
+    assert 0 < max(each[:-1]) <= 2 * signs_module.RUNS
+    assert (each[-1] > max(each[:-1])) == (horizon == STEPS)
+
+
+def test_steps_that_all_begin_elsewhere_are_no_part_of_it() -> None:
+    with explorer(steps=STEPS) as one:
+        for _ in range(STEPS):
+            drive(one, 1)
+        assert one.counts["late"] == 0
+        assert one.counts["jumps"] == STEPS - 1
 
 
 def test_gaps_are_no_part_of_the_test_for_a_delay() -> None:
