@@ -104,7 +104,7 @@ class Limits(Validated):
         }
 
     def check(self, system: System) -> None:
-        """Refuse a name that a system does not have, and bounds that it cannot heed."""
+        """Raise if nothing is bounded, a name is unknown, or the bounds of an input exclude 0."""
         states, inputs = names_of(system.state_labels), names_of(system.input_labels)
         ends = [end for _, *pair in self.bounds for end in pair]
         if not self.rates and not any(map(math.isfinite, ends)):

@@ -109,7 +109,7 @@ NEW_CONTAINERS = 100_000
 
 
 def collect_rarely() -> None:
-    """Let this process search for unreachable cycles less often.
+    """Make this process search for unreachable cycles less often.
 
     For programs, early, as imports gain most; a library leaves the setting to its user.
     """

@@ -32,7 +32,7 @@ class TrialView(ABC):
         ``env.integrator=rk4`` the middle of each step.
     accelerations : (t, r)
         Observed there: (x_{s+1} - x_s)/dt less the known part, in the learned rows; with rk4 also
-        less what the model's own step differs from its acceleration there.
+        less the difference between the model's integrated step and its pointwise acceleration.
     parameters : (q,)
         Parameters θ of the model that are learned.
     tie : (m,)

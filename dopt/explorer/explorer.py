@@ -86,7 +86,7 @@ class Explorer(Explored):
         states with a number that is not finite or beyond the limit of the plant. The exploration
         goes on from the next state
     ``jumps``
-        states for which an input was asked that are not those told last
+        ``ask`` was called with a state other than the last one passed to ``tell``
     ``resets``
         calls of :meth:`reset`
     ``missed``
@@ -371,7 +371,7 @@ class Explorer(Explored):
         return False
 
     def _refit(self, fits: FitBeside) -> None:
-        """Let a fit that is done come into force, and begin the next one when it is due.
+        """Bring a fit that is done into force, and begin the next one when it is due.
 
         Without a deadline a fit is waited for when the next one is due.
         """

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 class Recording:
-    """What was measured and applied in an exploration, in pieces without gaps.
+    """Measurements and applied inputs of an exploration, in pieces without gaps.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Recording:
 
 
 class Found(NamedTuple):
-    """What a fit has found, in the units of the plant."""
+    """Result of a fit, in the units of the plant."""
 
     constants: Array  # (c,)
     delay: float

@@ -109,7 +109,7 @@ _TEXTS = {
 
 
 class Steps(Protocol):
-    """What is read of the steps of an exploration, in scaled numbers."""
+    """Steps of an exploration that signs read, in scaled numbers."""
 
     @property
     def states(self) -> Array: ...
@@ -122,7 +122,7 @@ class Steps(Protocol):
 
 
 class Exploration(Protocol):
-    """What is read of a state of an exploration, except for the counts, which are changed."""
+    """State of an exploration that signs read; they change its counts."""
 
     done: int
     counts: Counter[str]
@@ -218,7 +218,7 @@ class Signs:
             self._steps, self._models = [], []
 
     def _begin(self, test: Iterator[None]) -> None:
-        """Let a test take what it needs of the exploration as it is now."""
+        """Begin a test, which copies what it needs of the exploration as it is now."""
         if next(test, True) is None:
             self._tests.append(test)
 

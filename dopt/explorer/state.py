@@ -108,7 +108,7 @@ class InFlight:
         return u if limit == math.inf else np.clip(u, -limit, limit)
 
     def depart(self, u: Array) -> Array:
-        """Let an input depart, and return what acts in the step that begins with it, (m,)."""
+        """Send an input, and return what acts in the step that begins with it, (m,)."""
         if self._flight is None:
             return u
         self._last = u
@@ -116,7 +116,7 @@ class InFlight:
         return self._flight.depart(u)
 
     def hold(self, u: Array | None, seconds: float | None) -> None:
-        """Let an input, (m,), or the last one, be held for a time [s]; for long if it is None."""
+        """Hold an input, (m,), or the last one, for a time [s]; without a time, for long."""
         if self._flight is None:
             return
         self._last = self._last if u is None else self.cut(u)
@@ -415,7 +415,7 @@ class ExplorerState:
         self.do(event)
 
     def plan(self) -> None:
-        """Let the policy choose an input at the state in which it will begin to act."""
+        """Plan the input at the state in which it will begin to act."""
         ahead = self.flight.ahead()
         if ahead is None:
             self.steps.plan_input(self.done)
@@ -435,7 +435,7 @@ class ExplorerState:
         return self.flight.cut(self.steps.inputs[self.done] * self._scaled.inputs)
 
     def _hold_input(self, time: float | None) -> None:
-        """Let inputs in flight move on to a state that did not follow within about dt.
+        """Move inputs in flight on to a state that did not follow within about dt.
 
         Without times, an input that was asked has been held for dt.
         """
@@ -530,7 +530,7 @@ class ExplorerState:
             self.counts["out_of_scale"] += warn_of_sizes(system, sizes, where, _UNITS, units)
 
     def _compare(self, planned: Array) -> None:
-        """Say so once if a plan that is replayed is another one than when it was made."""
+        """Warn once if a replayed plan differs from the recorded one."""
         if not np.array_equal(self.planned, planned) and not self._told_of_plans:
             self._told_of_plans = True
             _log.warning(
@@ -552,7 +552,7 @@ def _steps_of(spec: TrialSpec) -> Steps:
 
 
 def difference(stored: Any, given: Any, path: str = "") -> str:
-    """Say where two specifications differ first."""
+    """Return the first difference of two specifications, as text."""
     if isinstance(stored, dict) and isinstance(given, dict):
         for key in sorted({*stored, *given}, key=lambda key: (key != "name", key)):
             if stored.get(key) != given.get(key):

@@ -19,7 +19,7 @@ MARKS = {False: "trials of the paper", True: "everything"}
 
 
 def warm_up(everything: bool = False) -> None:
-    """See to it that the disk cache holds the kernel for all registered systems.
+    """Compile the kernel for all registered systems into the disk cache.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ def check_environment(disabled: object = None) -> None:
 
 @contextlib.contextmanager
 def errors_of_the_system() -> Iterator[None]:
-    """Raise UnusableEnvironmentError where the system fails, and not what is compiled."""
+    """Turn errors of the operating system into UnusableEnvironmentError."""
     try:
         yield
     except OSError as error:
@@ -164,7 +164,7 @@ def read(name: str) -> bytes | None:
 
 
 def drop(name: str) -> None:
-    """Remove a damaged file; say so of the first."""
+    """Remove a damaged file; warn about the first one."""
     if not _dropped:
         _log.warning("%s is damaged: what was lost is compiled again", CACHE_FOLDER / name)
     _dropped.append(name)
@@ -200,17 +200,17 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def can_be_filled() -> bool:
-    """Return whether what a process compiles is there for others."""
+    """Return True if other processes can read what this one compiles."""
     return not _not_stored and os.access(CACHE_FOLDER, os.W_OK)
 
 
 @contextlib.contextmanager
 def one_compiler_at_a_time(what: str) -> Iterator[None]:
-    """Let one process at a time put ``what`` into the cache; once it is there, all read freely.
+    """Serialise processes that put ``what`` into the cache; once it is there, all read freely.
 
-    ``what`` is the name of a function, and what tells its signature from its others after a hyphen.
-    The message goes to the logger ``dopt.kernel``. Its level is warning, which Python
-    shows on standard error where a program has set up no logging: somebody waits for it.
+    ``what``: name of a function and a hash of its signature, joined by a hyphen. The message goes
+    to the logger ``dopt.kernel``. Its level is warning, which Python shows on standard error where
+    a program has set up no logging: somebody waits for it.
     """
     name, _, _ = what.partition("-")
     with errors_of_the_system(), contextlib.ExitStack() as held:
@@ -227,14 +227,14 @@ def one_compiler_at_a_time(what: str) -> Iterator[None]:
 
 
 def for_whom() -> str:
-    """Return for whom code is compiled now."""
+    """Return who can use the code compiled now, for messages."""
     if CACHE_FOLDER not in _temporaries:
         return "once per machine"
     return f"for this command alone, as {_temporaries[CACHE_FOLDER]} cannot be written"
 
 
 def is_complete(what: str) -> bool:
-    """Return whether ``what`` is in the cache, undamaged."""
+    """Return True if ``what`` is in the cache, undamaged."""
     name = f"{what}.complete"
     if CACHE_FOLDER / name in _intact:
         return True
@@ -249,14 +249,14 @@ def is_complete(what: str) -> bool:
 
 
 def mark_complete(what: str, files: Sequence[str] | None = None) -> None:
-    """Remember that ``what`` is in the cache, in these files: all that this process has used."""
+    """Record which files hold ``what``, by default all that this process has used."""
     used = dict.fromkeys(_used if files is None else files)
     there = [name for name in used if (CACHE_FOLDER / name).exists()]
     write(f"{what}.complete", "\n".join(there).encode())
 
 
 def missing(names: Sequence[str]) -> list[str]:
-    """Return the names of the functions of which the cache holds nothing, or something damaged."""
+    """Return the names of the functions that are missing or damaged in the cache."""
     marks = _marks_of(names)
     return [name for name in names if not marks[name] or not all(map(is_complete, marks[name]))]
 
@@ -280,7 +280,7 @@ ENDS = ("first", "last")
 """Ends of the list of parts, at which the two processes begin."""
 
 SECONDS_BETWEEN_MESSAGES = {True: 1.0, False: 30.0}
-"""On a terminal, where each message takes the place of the one before, and elsewhere."""
+"""By whether messages go to a terminal, where each overwrites the one before."""
 
 _PROGRAM = "dopt.kernel.warming"
 
@@ -327,7 +327,7 @@ def compiling(names: Sequence[str]) -> Iterator[None]:
 
 
 def _said(text: str, *, last: bool) -> bool:
-    """Say it, unless another process does on the same standard error, as workers of a launch."""
+    """Print progress, unless another worker does so on the same standard error."""
     try:
         if not lock_stream(sys.stderr, release=last):
             return False
@@ -342,7 +342,7 @@ def _said(text: str, *, last: bool) -> bool:
 
 
 def _on_terminal() -> bool:
-    """Return whether messages go to a terminal, and to no handler of the program."""
+    """Return True if messages go to a terminal, and to no handler of the program."""
     return not _log.hasHandlers() and sys.stderr is not None and sys.stderr.isatty()
 
 

@@ -98,7 +98,7 @@ def _holds_compiled(kind: NumbaType) -> bool:
 
 
 def stored(dispatcher: Any) -> Any:
-    """Let a compiled function keep its machine code on disk, if the package's sources hold it."""
+    """Store the machine code of a function of the package on disk."""
     path = Path(inspect.getfile(dispatcher.py_func)).resolve()
     if path.is_relative_to(_PACKAGE):
         folder = path.relative_to(_PACKAGE).with_suffix("")
@@ -117,7 +117,7 @@ def compiled(function: F) -> F:
 
 
 def called_from_python(function: F) -> F:
-    """Compile a function during which other threads of the interpreter run."""
+    """Compile a function that releases the interpreter's lock."""
     return _njit(function, nogil=True)
 
 
@@ -134,7 +134,7 @@ def _njit(function: F, *, nogil: bool = False) -> F:
 
 
 def compilable(function: F) -> F:
-    """Let compiled code call a plain function and the helpers that it uses from its own module."""
+    """Make a plain function, and its helpers in the same module, callable by compiled code."""
     for name in function.__code__.co_names:
         helper = function.__globals__.get(name)
         if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
@@ -273,7 +273,7 @@ def _names_read(code: CodeType) -> Iterator[str]:
 
 
 def _content(value: Any, own: str) -> str | None:
-    """Return text that changes with a value in compiled code, None where it cannot be told."""
+    """Return text that changes with a value in compiled code, None if there is no such text."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}{hashlib.sha256(value.tobytes()).hexdigest()}"
     if isinstance(value, (bool, int, float, complex, str, Enum)):

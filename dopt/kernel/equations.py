@@ -77,7 +77,7 @@ def _where(condition: NumbaType, first: NumbaType, second: NumbaType) -> NumbaTy
 
 
 def _compare_real_parts(compare: Callable[[Scalar, Scalar], Scalar]) -> None:
-    """Let compiled equations compare complex states, by their real parts."""
+    """Define comparisons of complex numbers in compiled equations, by their real parts."""
 
     def of_real_parts(a: Scalar, b: Scalar) -> Scalar:
         return compare(a.real, b.real)

@@ -52,7 +52,7 @@ FITS_WITH_RESTARTS = 4
 """First fits, of few samples, that also start from guesses."""
 
 MOST_FITTED = 1000
-"""Most samples of a fit; of more it takes an even choice."""
+"""Most samples of a fit; of more, an even choice is taken."""
 
 
 def guessed(phi: Array, y: Array) -> Array:
@@ -199,7 +199,7 @@ def fit_process(
 
 
 def evenly(count: int, most: int) -> Integers:
-    """Return at most so many places of a number of samples, evenly spread."""
+    """Return at most ``most`` of ``count`` indices, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
@@ -216,12 +216,12 @@ class Samples(NamedTuple):
     posterior: Posterior
 
     def call(self, function: CompiledFunction, *more: Array) -> Any:
-        """Call a compiled function of them."""
+        """Call a compiled function with these arrays first."""
         kinds = tuple(map(kind_of, (*self, *more)))
         return compiled_for(function, kinds)(*self, *more)
 
     def copied(self) -> Samples:
-        """Return a copy, whose factors are to begin where those in force do not."""
+        """Return a copy that shares the factors, in the half that is not in force."""
         network, theta, posterior = self
         n_samples = network.process.n_samples.copy()
         parts = posterior._asdict().items()
@@ -232,7 +232,7 @@ class Samples(NamedTuple):
         return Samples(network._replace(process=process), theta.copy(), other)
 
     def replace(self, other: Samples) -> None:
-        """Take over all but the factors."""
+        """Copy all arrays of another except its factors."""
         own, others = (
             (one.network.process.n_samples, one.theta, *one.posterior[1:]) for one in (self, other)
         )
@@ -254,7 +254,7 @@ class Samples(NamedTuple):
 
 
 def renewed(samples: Samples, numbers: Array) -> Samples:
-    """Return samples that have no factors with other numbers, (r, 2p + 3), and factors, (G, n, n).
+    """Return samples with factors, (G, n, n), for other numbers, (r, 2p + 3).
 
     These begin at 0.
     """
@@ -285,7 +285,7 @@ class Renewal:
         self._added, self._is_made = 0, False
 
     def note(self) -> None:
-        """Take in the newest sample of those in force."""
+        """Remember the newest sample of the posterior in force."""
         newest = self._present.posterior.newest_state, self._present.posterior.newest_target
         self._since.append((newest[0].copy(), newest[1].copy()))
 
@@ -295,7 +295,7 @@ class Renewal:
         return self._samples._replace(posterior=posterior), self._numbers
 
     def install(self, made: Samples) -> None:
-        """Take what another process has made, and add the samples since; in any thread."""
+        """Copy what another process has made, and add the samples since. Any thread may call it."""
         own, factors = self._samples.posterior, made.posterior.factors
         first, (G, n, _) = own.first.copy(), factors.shape
         np.copyto(own.factors[first[0] : first[0] + G, :n, :n], factors)
@@ -305,7 +305,7 @@ class Renewal:
         self._add_those_since()
 
     def finish(self) -> None:
-        """Do what is left, and let it come into force."""
+        """Add the samples that are left, and bring the posterior into force."""
         if not self._is_made:
             self._samples.renumber(self._numbers)
         self._add_those_since()
@@ -343,7 +343,7 @@ class Evidence:
         self._done, self.due = 0, spec.learner.next_fit(0)
 
     def request(self) -> Request:
-        """Return what the next fit needs: a copy, and the samples go on."""
+        """Return a copy of what the next fit needs."""
         network, theta, posterior = self._samples
         n = int(network.process.n_samples[0])
         p = network.sizes[0]
@@ -357,18 +357,18 @@ class Evidence:
         return Request(phi, targets, posterior.counts[chosen], starts, self._noise)
 
     def take(self, numbers: Array, steps: int) -> None:
-        """Let the numbers of a fit after so many steps come into force."""
+        """Bring the numbers of a fit into force after ``steps`` steps."""
         self._samples.renumber(numbers)
         self._done += 1
         self.due = self._learner.next_fit(steps)
 
     def begin_renewal(self, numbers: Array) -> None:
-        """Let a posterior with the numbers of a fit be made, and the present one go on."""
+        """Begin a posterior with the numbers of a fit; the present one stays in force."""
         self.renewal = Renewal(self._samples, numbers)
         self._done += 1
 
     def first_request(self) -> tuple[Samples, Array]:
-        """Return a small request, and make ready what takes samples and renewals: memory, code."""
+        """Return a small request; load the code of renewals, touch the memory of the factors."""
         factors = self._samples.posterior.factors
         factors += 0.0  # a step that touches new pages of 2 MiB takes 5 ms longer
         small = Renewal(self._samples, self.numbers)
@@ -378,7 +378,7 @@ class Evidence:
         return request
 
     def fit(self, points: Evaluation) -> float:
-        """Fit the kernels, with as many samples as were due; return the time that it took [µs]."""
+        """Fit the kernels when due, and return the time taken [µs]."""
         begun = time.perf_counter()
         self.take(fit_rows(self.request()), self.due)
         points.n_basis[0] = 0

@@ -44,7 +44,7 @@ LITTLE = 0.1
 """Variance of what a sample shows, in units of its noise, below which it adds little."""
 
 SMALLEST_EXPONENT = -700.0
-"""Below it exp is taken as at it, 1e-304."""
+"""Exponents below it count as it: exp is 1e-304."""
 
 
 @compiled

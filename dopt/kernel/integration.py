@@ -23,7 +23,7 @@ from dopt.types import Matrix, Stack, Vector
 
 @compiled
 def n_stages(plant: Plant) -> int:
-    """Return how often a step asks for the derivative."""
+    """Return the number of derivatives that a step evaluates."""
     return 1 if plant.integrator == Integrator.EULER else 4
 
 
@@ -103,8 +103,8 @@ def observe_euler(trial: Trial, t: int, dt: float, target: Vector) -> None:
 def observe_runge_kutta(trial: Trial, t: int, dt: float, target: Vector) -> None:
     """Write the accelerations observed in the middle of the step, (r,), after dt seconds.
 
-    What the model's own step differs from the acceleration that it has there is added to them: a
-    model whose error at them is 0 predicts x_{t+1}.
+    Adds the difference between the model's integrated step and its pointwise acceleration, so that
+    a model without error there predicts x_{t+1}.
     """
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     x, u = trial.record.states[t], trial.state.estimate.inputs[t]

@@ -47,7 +47,7 @@ def learn(trial: Trial, t: int, target: Vector) -> None:  # noqa: ARG001  # it l
 
 @compiled
 def predict(trial: Trial, t: int, underweighting: float) -> None:
-    """Move P and Ψ from x_t to x_{t+1}, of which the estimate is the prediction already."""
+    """Move P and Ψ from x_t to x_{t+1}, whose estimate holds the prediction."""
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     estimate, rows = trial.state.estimate, plant.learned_rows
     r, dt = rows.shape[0], estimate.durations[t]

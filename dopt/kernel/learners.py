@@ -151,7 +151,7 @@ def filter_step(covariance: Covariance, theta: Vector, rows: Matrix, residuals: 
 def forget(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
     """Turn M⁻¹ into (f M + D)⁻¹ at step t (:class:`dopt.learning.ExtendedKalman`).
 
-    D has the entry ``renewal`` at the ``renewed`` diagonal places whose turn it is.
+    D has the entry ``renewal`` at the next ``renewed`` diagonal places, in turn.
     """
     settle(covariance)
     upper, pending, q = covariance.upper, covariance.pending, covariance.size
@@ -293,7 +293,7 @@ def learn_fitted(trial: Trial, t: int, target: Vector) -> None:
 
 @compiled
 def _write_information(state: State, factor: Matrix, noise_variance: float) -> bool:
-    """Write M⁻¹ and the factor of M, where they are held; tell whether M⁻¹ is finite.
+    """Write M⁻¹ and the factor of M, where they are held; return whether M⁻¹ is finite.
 
     Given is the factor of ρ M.
     """
@@ -454,7 +454,7 @@ def _write_step(
     step: Vector,
     candidate: Vector,
 ) -> bool:
-    """Write δ, (q,), and θ + δ + κ, (q,); tell whether the step is worth a try.
+    """Write δ, (q,), and θ + δ + κ, (q,); return whether the step is worth a try.
 
     It is not where the factor of JᵀJ + (ρ + μ) I, (q, q), which is overwritten, is not definite, or
     where the correction is so long that the samples are not described by it.

@@ -69,7 +69,7 @@ def settle(covariance: Covariance) -> None:
 
 @compiled
 def _multiply_and_add(covariance: Covariance, k: int, residuals: Vector) -> Matrix:
-    """Do what :func:`multiply_planned` does; the residuals e of the deferred rows become L⁻¹e."""
+    """As :func:`multiply_planned`; the residuals e of the deferred rows become L⁻¹e."""
     n = covariance.n_deferred[0]
     _make_room(covariance, n)
     rows, products = covariance.rows[: n + k], covariance.products[: n + k]
@@ -229,7 +229,7 @@ def restore(covariance: Covariance) -> None:
 
 @compiled
 def replaced(covariance: Covariance) -> None:
-    """Let M⁻¹ be what its upper triangle has become, without pending rows."""
+    """Complete the diagonal blocks of a new upper triangle, and drop pending rows."""
     upper = covariance.upper
     for i in range(upper.shape[0]):
         for j in range(i - i % LANES, i):
@@ -278,7 +278,7 @@ PANEL = 32
 
 @compiled
 def factorize(matrix: Matrix) -> bool:
-    """Replace a symmetric matrix, (q, q), by its factor C; tell whether it is positive definite.
+    """Replace a symmetric matrix, (q, q), by its factor C; return whether it is positive definite.
 
     The upper triangle is read. It becomes Cᵀ, panel by panel, before C takes its place.
     """
@@ -368,7 +368,7 @@ def _divide(row: Vector, by: float) -> None:
 def write_inverse(factor: Matrix, out: Matrix) -> bool:
     """Write the upper triangle of (C Cᵀ)⁻¹ into a matrix of at least (q, q).
 
-    Tells whether it is finite. With X = C⁻¹ it is XᵀX; neither is multiplied where X is zero.
+    Returns whether it is finite. With X = C⁻¹ it is XᵀX; neither is multiplied where X is zero.
     """
     q = factor.shape[0]
     X = np.zeros((q, q))

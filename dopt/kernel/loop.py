@@ -36,7 +36,7 @@ from dopt.types import Matrix, Stack, Vector
 
 @compiled
 def do_nothing(trial: Trial, t: int, row: Vector) -> None:
-    """Leave u_t as it was chosen, in numpy too, or parameters as an update in numpy returned them.
+    """Leave the input, or the parameters, as they are.
 
     Where no limits are enforced, nothing of the model's errors is remembered.
     """
@@ -57,7 +57,7 @@ def members_or_one(state: State) -> Matrix:
 
 @compiled
 def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
-    """Let the member whose turn it is learn, and then the first one, whose M stays.
+    """Train the next ensemble member in turn, then member 0, which owns M.
 
     θ and θ₀ of the state belong to the first member before and after.
     """
@@ -78,7 +78,7 @@ def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
 
 @called_from_python
 def plan_next(held: HeldTrial, t: int) -> None:
-    """Write u_t, the first of which was drawn before the trial, and the time that it took.
+    """Write u_t and its planning time; u_0 was drawn before the trial.
 
     It is what the policy chooses, unless the limits of the trial demand another one, cut to what
     the plant can apply.

@@ -83,7 +83,7 @@ def _angle(network: Network, phi: Vector, i: int) -> float:
 
 
 STEP = 1e-30
-"""Imaginary part of a complex step: its square is nothing beside any number."""
+"""Imaginary part of a complex step: its square underflows beside any number."""
 
 DIFFERENCE = 2e-5
 """Change of a point, relative to its size and 1, over which J is differentiated along it."""
@@ -242,7 +242,7 @@ def joined(x: Vector, u: Vector, n_inputs_read: int) -> Vector:
 
 @compiled
 def n_next_points(network: Network) -> int:
-    """Return how many points stand for a state whose input is not chosen yet: 1 or 2 m."""
+    """Return the number of points for a state whose input is not chosen yet: 1 or 2 m."""
     return max(1, 2 * network.n_inputs_read)
 
 
@@ -492,7 +492,7 @@ def write_gradients(
     component: int,
     out: Matrix,
 ) -> None:
-    """Do what :func:`write_network_gradients` does for a model of any kind."""
+    """As :func:`write_network_gradients`, for a model of any kind."""
     if network.kind == ModelKind.MLP:
         write_network_gradients(network, theta, x, directions, component, out)
         return

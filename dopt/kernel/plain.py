@@ -30,7 +30,7 @@ def monotonic_microseconds() -> float:
 
 
 class Held(NamedTuple):
-    """What stands for a structure that compiled code holds."""
+    """Stand-in for a structure that compiled code holds."""
 
     trial: Any = None
     steps: Any = None
@@ -42,7 +42,7 @@ def trial_in(held: Held) -> Any:
 
 
 def or_plain(plain: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Let ``plain`` stand in the interpreter for a function that only the compiler has."""
+    """Use ``plain`` in the interpreter in place of a function that only the compiler has."""
 
     def chosen(compiled: Callable[..., Any]) -> Callable[..., Any]:
         if PLAIN:

@@ -31,7 +31,7 @@ from dopt.types import CompiledFunction, NumbaType
 
 
 def layout_of(value: object) -> Hashable:
-    """Return what the type of an argument for Numba depends on, which takes longer to find out."""
+    """Return a cheap key of an argument's type for Numba."""
     if isinstance(value, tuple):
         return (type(value), *map(layout_of, value))
     if isinstance(value, np.ndarray):
@@ -117,7 +117,7 @@ def names_of(policy: Policy, learner: Learner, functions: list[CompiledFunction]
 
 
 def _source(part: Policy | Learner) -> str | Callable[..., None]:
-    """Return the path of the function of a policy or a learner, or a user's own function."""
+    """Return the path of the function of a policy or a learner, or a custom function."""
     if isinstance(part, CompiledPolicy):
         return part.plan
     return part.learn if isinstance(part, CompiledLearner) else part.kernel_function

@@ -109,7 +109,7 @@ class NumpyParts:
         return 1e6 * seconds
 
     def note(self, t: int) -> float:
-        """Let the plan take in step t, which was learned from, and return its time [µs]."""
+        """Tell the plan about step t, which was learned from; return the time taken [µs]."""
         start = time.perf_counter()
         if self._planner:
             self._planner.observe(self._view(t + 1))
@@ -326,7 +326,7 @@ class KernelSteps(KernelState):
         return self.record.loss
 
     def begin(self, t: int, state: Array) -> None:
-        """Let step t begin at a state, (d,), whatever came before it."""
+        """Begin step t at a state, (d,), whatever came before it."""
         self.record.states[t] = state
         if len(self.state.estimate.starts):
             self.state.estimate.starts[t] = state
@@ -349,7 +349,7 @@ class KernelSteps(KernelState):
         return state
 
     def note_asked(self, u: Array) -> None:
-        """Let the limits of rates count from an input, (m,), and not from what acted."""
+        """Count limits of rates from an input, (m,), in place of what acted."""
         if len(self.state.prediction.last_input):
             self.state.prediction.last_input[:] = u
 
@@ -421,7 +421,7 @@ class SteppedTrial(KernelSteps):
         return goes_on
 
     def _go_on(self, t: int) -> bool:
-        """Let the system go on to x_{t+1}, and return whether that is within its limit."""
+        """Advance the system to x_{t+1}, and return whether that is within its limit."""
         if self._episode is None:
             return bool(self.call(loop.act_next, t))
         self.inputs[t] = self._episode.step(self.inputs[t].copy())
@@ -436,7 +436,7 @@ FIRST_STEPS = 300
 """Steps of a trial before it is known what a step costs; trials of the paper have no more."""
 
 PIECE_SECONDS = 1.0
-"""Interval at which compiled code comes back to the interpreter, which can then heed a signal."""
+"""Interval at which compiled code returns to the interpreter, so that signals are handled."""
 
 
 class KernelTrial(KernelState):

@@ -74,7 +74,7 @@ def largest_eigenvalue(projected: Matrix, basis: Matrix, removed: Matrix) -> flo
 
 
 FEW_ROWS = 40
-"""Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
+"""Largest number of products a step for which a full copy of M⁻¹ does not pay."""
 
 
 class Path(NamedTuple):
@@ -431,7 +431,7 @@ def _share(problem: Problem, begun: Rolled, k: int) -> float:
 
 @compiled
 def _scores(problem: Problem, begun: float, ended: Rolled, first: int, count: int) -> Vector:
-    """Return the scores of the plans that end with so many paths, given log det up to the switch.
+    """Score ``count`` plans that share the path before the switch; ``begun`` is its log det.
 
     They are -∞ where the path leaves the bounds of a state, or the score is not finite.
     """

@@ -96,7 +96,7 @@ def carry(plant: Plant, x: Vector, u: Vector, following: Vector) -> None:
 
 @compiled
 def start_filters(trial: Trial, x: Vector) -> None:
-    """Let the filters begin at a state, (d,), with an input of 0."""
+    """Start the filters at a state, (d,), with an input of 0."""
     filtered = trial.state.estimate.filtered
     filtered[0] = x
     filtered[2] = x

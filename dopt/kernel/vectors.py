@@ -221,7 +221,7 @@ def _generator(start: str, sign: int, upper: bool) -> Callable[..., Any]:
 
 
 def _in_numpy(left: Matrix, right: Matrix, out: Matrix) -> Matrix:
-    """Return as much of a product as is written into ``out``; factors may be larger."""
+    """Return the part of a product that fits ``out``; factors may be larger."""
     n, m = out.shape
     part: Matrix = left[:n] @ right[: left.shape[1], :m]
     return part

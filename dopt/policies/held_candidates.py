@@ -154,7 +154,7 @@ class DisagreementPlan(Planner):
         return rate
 
     def observe(self, view: TrialView) -> None:
-        """Let the other networks take the learning step of the trial's own."""
+        """Train the other networks by the learning step of the trial's own."""
         newest = slice(-self._networks.learner.window, None)
         states, targets = view.sampled[newest], view.accelerations[newest]
         gradient = self._networks.loss_gradient(self._others, states, targets)

@@ -390,7 +390,7 @@ class Lockstep(BatchSteps):
         self.observe(t, system.dt)
 
     def _step_episodes(self, t: int, u: Tensor) -> Tensor:
-        """Let the runs of a black box go on; return what was applied, (n, m).
+        """Advance the runs of a black box; return what was applied, (n, m).
 
         Where a run has restarted, the state before the step becomes its start.
         """
@@ -512,7 +512,7 @@ class ReferenceSteps:
         return self.inputs
 
     def begin(self, t: int, state: Array) -> None:
-        """Let step t begin at a state, (d,), whatever came before it."""
+        """Begin step t at a state, (d,), whatever came before it."""
         self.states[t] = state
 
     def replace(self, parameters: Array, constants: Array) -> None:

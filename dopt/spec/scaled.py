@@ -78,7 +78,7 @@ class Scaled:
 
     @functools.cached_property
     def accelerations(self) -> Array:
-        """What its learned accelerations are multiplied by, (r,), in units of the plant."""
+        """Units of the learned accelerations, (r,), by which they are multiplied."""
         return self.states[list(self.system.learned_rows)]
 
     def scaled_predictions(self, predict: Accelerations) -> Accelerations:

@@ -352,7 +352,7 @@ def _checked(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class MarkedTrial:
-    """What a results database holds as a trial, although no launch can run it."""
+    """Entry of a results database that no launch can run, such as an exploration."""
 
     seed: int
     config_json: str

@@ -439,7 +439,7 @@ class Plant:
 
     @functools.cached_property
     def scales(self) -> tuple[float, ...]:
-        """What each state is divided by in scaled numbers (:mod:`dopt.systems.properties`)."""
+        """Divisors of the states in scaled numbers (:mod:`dopt.systems.properties`)."""
         return scales(self.system(1), self._sizes)
 
     @functools.cached_property

@@ -41,7 +41,7 @@ With it the friction takes at most half of a small rate in a step: Euler steps d
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Hardware(Validated):
-    """What stands between a policy and a system (:func:`Real`).
+    """Hardware between a policy and a system (:func:`Real`).
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Hardware(Validated):
 
     @property
     def settings(self) -> dict[str, float]:
-        """What differs from a system without hardware, by name."""
+        """Settings that differ from a system without hardware, by name."""
         fields = dataclasses.fields(self)
         own = {field.name: getattr(self, field.name) for field in fields}
         return {field.name: own[field.name] for field in fields if own[field.name] != field.default}
@@ -223,7 +223,7 @@ def following_actuator(
 
 
 class _Behind:
-    """What the classes of systems behind hardware have beside the class of the system."""
+    """Base of the classes of systems behind hardware, beside the class of the system."""
 
     def __post_init__(self: Any) -> None:
         system, hardware = self.wrapped, self.hardware
@@ -324,7 +324,7 @@ class Flight:
         self.actuator = np.zeros(n_inputs)
 
     def depart(self, u: Array) -> Array:
-        """Let an input depart, and return what acts in the step that begins with it, (m,)."""
+        """Send an input, and return what acts in the step that begins with it, (m,)."""
         waiting = [u, *self.inputs]
         newer, older = waiting[self._whole], waiting[math.ceil(self._whole + self._fraction)]
         mean, self.actuator = following_actuator(
@@ -368,7 +368,7 @@ class _Episode:
         return np.concatenate([state, *self._flight.inputs, *actuator])
 
     def step(self, inputs: Array) -> Array:
-        """Let an input, cut to the supply, depart; apply what arrives, and return the former."""
+        """Send an input, cut to the supply; apply what arrives, and return the former."""
         applied: Array = np.clip(inputs, -self._cut_at, self._cut_at)
         self.new_start, waiting = None, self._with_inputs(np.empty(0))
         self._inner.step(self._flight.depart(applied))
