@@ -454,7 +454,7 @@ def run_trials(
         if t in noted:
             batch.checkpoints[t] = batch.theta.cpu().numpy().copy()
             batch.feedbacks[t] = [planner.feedback() for planner in batch.planners]
-        if t < batch.system.horizon:
+        if t < batch.system.horizon and not bool(batch.diverged.all()):
             batch.step(t)
     n = len(specs)
     seconds = ((time.perf_counter() - wall) / n, (time.process_time() - cpu) / n)

@@ -22,13 +22,14 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, vmap
+from torch.func import vmap
 from torch.nn.utils import parameters_to_vector
 
 from dopt.algorithm import TIE_MARGIN
@@ -110,11 +111,21 @@ class NetworkFunction:
 
     def __init__(self, system: System, module: nn.Module) -> None:
         self._system, self._module = system, module
-        every = [*module.named_parameters(remove_duplicate=False)]
-        self._tied = len(every) > len([*module.parameters()])
-        self._shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
-        self._lengths = [shape.numel() for shape in self._shapes.values()]
-        self._buffers = dict(module.named_buffers())
+        own = [*module.parameters()]
+        self._shapes = [parameter.shape for parameter in own]
+        self._lengths = [shape.numel() for shape in self._shapes]
+        places = {id(parameter): i for i, parameter in enumerate(own)}
+        # Tables and names in which the modules look for them; tied parameters stand in several.
+        self._slots: list[tuple[dict[str, Any], str, int]] = [
+            (part._parameters, name, places[id(parameter)])
+            for part in module.modules()
+            for name, parameter in part.named_parameters(recurse=False, remove_duplicate=False)
+        ]
+        self._buffers: list[tuple[dict[str, Any], str, Tensor]] = [
+            (part._buffers, name, buffer)
+            for part in module.modules()
+            for name, buffer in part.named_buffers(recurse=False, remove_duplicate=False)
+        ]
         self._at_once: bool | None = None  # known once the module has been tried
         self._one_by_one = vmap(self._network, in_dims=(None, 0))
         self._over_trials, self._over_both = vmap(self._network), vmap(self._one_by_one)
@@ -165,17 +176,28 @@ class NetworkFunction:
         return x.new_tensor(values if along is None else [v.imag / STEP for v in values])
 
     def _leaves(self, theta: Tensor) -> list[Tensor]:
-        parts = zip(theta.detach().split(self._lengths), self._shapes.values(), strict=True)
+        parts = zip(theta.detach().split(self._lengths), self._shapes, strict=True)
         return [part.view(shape).requires_grad_() for part, shape in parts]
 
     def _network(self, theta: Tensor, phi: Tensor) -> Tensor:
-        parts = zip(theta.split(self._lengths), self._shapes.values(), strict=True)
+        parts = zip(theta.split(self._lengths), self._shapes, strict=True)
         return self._call([part.view(shape) for part, shape in parts], phi)
 
     def _call(self, weights: Sequence[Tensor], phi: Tensor) -> Tensor:
-        named = dict(zip(self._shapes, weights, strict=True))
-        named |= {name: buffer.to(phi.device) for name, buffer in self._buffers.items()}
-        out: Tensor = functional_call(self._module, named, (phi,), tie_weights=self._tied)
+        """Return the module's outputs with other parameters, which it has during this call alone.
+
+        As torch.func.functional_call, whose checks take longer than a small network.
+        """
+        given = [(table, name, weights[place]) for table, name, place in self._slots]
+        given += [(table, name, buffer.to(phi.device)) for table, name, buffer in self._buffers]
+        before = [(table, name, table[name]) for table, name, _ in given]
+        try:
+            for table, name, tensor in given:
+                table[name] = tensor
+            out: Tensor = self._module(phi)
+        finally:
+            for table, name, tensor in before:
+                table[name] = tensor
         return out
 
     def _over_points(self, theta: Tensor, phi: Tensor) -> Tensor:
@@ -231,7 +253,8 @@ def stack(values: Sequence[Scalar]) -> Tensor:
 def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
     """Return the known part of dx/dt, (..., d), for states (..., d) and inputs (..., m)."""
     if _alone(x, u):
-        return x.new_tensor([system.known(x[0].tolist(), u[0].tolist(), system.parameters)])
+        with suppress(ArithmeticError):  # tensors give infinity or NaN
+            return x.new_tensor([system.known(x[0].tolist(), u[0].tolist(), system.parameters)])
     return stack(system.known(x.unbind(-1), u.unbind(-1), system.parameters))
 
 
@@ -248,7 +271,8 @@ def true_accelerations(system: System, x: Tensor, u: Tensor, step: int) -> Tenso
     parameters = system.history[min(step, len(system.history) - 1)].tolist()
     point = torch.cat([x, u], dim=-1) if system.reads_inputs else x
     if _alone(point):
-        return x.new_tensor([system.accelerations(point[0].tolist(), parameters)])
+        with suppress(ArithmeticError):
+            return x.new_tensor([system.accelerations(point[0].tolist(), parameters)])
     return stack(system.accelerations(point.unbind(-1), parameters))
 
 
@@ -280,9 +304,10 @@ def input_matrix(system: System, x: Tensor) -> Tensor:
     n, d = x.shape
     if _alone(x):
         steps = (1j * STEP * np.eye(system.n_inputs)).tolist()
-        rates = [system.known(x[0].tolist(), step, system.parameters) for step in steps]
-        slopes = [[complex(rate).imag / STEP for rate in of_input] for of_input in rates]
-        return system.dt * x.new_tensor([slopes]).mT
+        with suppress(ArithmeticError):
+            rates = [system.known(x[0].tolist(), step, system.parameters) for step in steps]
+            slopes = [[complex(rate).imag / STEP for rate in of_input] for of_input in rates]
+            return system.dt * x.new_tensor([slopes]).mT
     with torch.enable_grad():
         u = x.new_zeros(n, d, system.n_inputs).requires_grad_()
         known = known_flow(system, x.unsqueeze(1).expand(-1, d, -1), u)

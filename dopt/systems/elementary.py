@@ -71,10 +71,11 @@ def where(condition: Scalar, first: Scalar, second: Scalar) -> Scalar:
 
 
 def _apply(x: Scalar, name: str) -> Scalar:
-    if isinstance(x, float | int):
-        return getattr(math, name)(x)
-    if isinstance(x, complex):
-        return getattr(cmath, name)(x)
+    if isinstance(x, float | int | complex):
+        try:
+            return getattr(cmath if isinstance(x, complex) else math, name)(x)
+        except ValueError:  # of an infinite argument, of which arrays and compiled code give NaN
+            return math.nan
     if isinstance(x, np.ndarray | np.generic):
         return getattr(np, name)(x)
     return getattr(x, name)()

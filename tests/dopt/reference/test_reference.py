@@ -111,6 +111,58 @@ def test_a_network_is_called_once_for_many_points_where_that_gives_the_same(
     assert module.called_with == at_once
 
 
+class Tied(nn.Module):
+    """Uses a layer twice, a matrix under two names, a normalised layer, and counts its calls."""
+
+    calls: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = nn.Sequential(nn.Linear(3, 3), nn.Tanh())
+        self.again = nn.Linear(3, 3)
+        self.again.weight = self.inner[0].weight
+        self.normal = nn.utils.parametrizations.weight_norm(nn.Linear(3, 1))
+        self.register_buffer("calls", torch.zeros(()))
+        self.double()
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        self.calls += 1.0
+        if not bool(features.detach().isfinite().all()):
+            raise RuntimeError("features are not finite")
+        out: torch.Tensor = self.normal(self.again(self.inner(self.inner(features))))
+        return out
+
+
+def test_a_module_has_other_parameters_during_a_call_alone() -> None:
+    """torch.func.functional_call is the oracle."""
+    system, module = SYSTEMS["pendulum"](), Tied()
+    own = {name: (one, one.detach().clone()) for name, one in module.named_parameters()}
+    theta = torch.randn(1, sum(one.numel() for one, _ in own.values())).double()
+    parts = theta[0].split([one.numel() for one, _ in own.values()])
+    named = {n: part.view_as(own[n][0]) for n, part in zip(own, parts, strict=True)}
+    function = NetworkFunction(system, module)
+    x = torch.randn(1, 1, system.n_states).double()
+    features = torch.tensor(system.featurize(x[0].numpy()))[0]
+    expected = torch.func.functional_call(module, named, (features,))
+    assert torch.equal(function(theta, x)[0, 0], expected)
+    with pytest.raises(RuntimeError, match="not finite"):
+        function(theta, x * torch.inf)
+    now = dict(module.named_parameters())
+    assert all(now[n] is one and torch.equal(one, before) for n, (one, before) in own.items())
+    assert module.again.weight is module.inner[0].weight
+
+
+@pytest.mark.parametrize("friction", [50.0, 1000.0, 1e120])
+def test_a_trial_that_diverges_ends_as_in_the_kernel(friction: float) -> None:
+    """Numbers of Python raise where tensors and compiled code give infinity or NaN."""
+    spec = trial("pendulum", "random", env={"friction": friction}).to_mapping()
+    own = {"model": {"_target_": "tests.dopt.custom_networks.Stack"}, "path": "reference"}
+    alone, compiled = (run_trial(TrialSpec.from_mapping(spec | one)) for one in (own, {}))
+    assert alone.diverged_at == compiled.diverged_at
+    assert alone.diverged_at is not None
+    np.testing.assert_array_equal(alone.states, compiled.states)
+
+
 SIZES = (7, SMALL, SMALL + 1, 150)
 
 

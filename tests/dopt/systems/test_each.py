@@ -38,6 +38,14 @@ from tests.dopt.systems.mechanics import MECHANICS
 from tests.dopt.test_checks import broken_system
 
 
+@pytest.mark.parametrize("x", [math.inf, -math.inf, math.nan, complex(math.inf, 0.0)])
+@pytest.mark.parametrize("function", [sin, cos, tanh])
+def test_infinite_numbers_give_what_arrays_give(function: Any, x: complex) -> None:
+    with np.errstate(all="ignore"):
+        expected = function(np.array([x]))[0]
+    np.testing.assert_equal(abs(function(x)), abs(expected))
+
+
 def test_without_steering_it_drives_straight_on_to_its_terminal_speed() -> None:
     car = Car()
     path = simulate(car, np.tile([1.0, 0.0], (1500, 1, 1)))[-1, 0]
