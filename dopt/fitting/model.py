@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from dopt.errors import SpecificationError
 from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values, Work, work_for
@@ -23,7 +24,7 @@ from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
 from dopt.systems.expressions import FUNCTIONS, compiled_text
-from dopt.systems.plant import Encoder, Plant, Unknown
+from dopt.systems.plant import Encoder, Plant, Unknown, first_guess
 from dopt.types import Array, Booleans, CompiledFunction, Equation, Integers, NumbaType
 
 _SYMBOLS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
@@ -163,10 +164,11 @@ class _Chain:
 
 _KINDS = {"identity": 0, "cos": 1, "sin": 2}
 
-HOLDS = ("zero", "linear")
+HOLDS = {"zero": 0, "linear": 1, "cubic": 3}
+"""Degrees of the curve through the rows of an input."""
 
-FINEST = 0.004
-"""Longest part of a sample over which a linearly interpolated input is taken as constant [s]."""
+PARTS = 4
+"""Parts of a sample over which an interpolated input is taken as constant."""
 
 MOST_STEPS = 300.0
 """Steps of a plant in one of a log, or of a log in one of a plant, beyond which a unit is wrong."""
@@ -236,7 +238,8 @@ class Model:
     """A plant as it is simulated.
 
     The parameters p are the unknown constants, the weights of the network, and where they are
-    unknown the delay and the lag, each in standard deviations of its prior.
+    unknown the delay and the lag, each in standard deviations of its prior. A ``delay`` that is
+    given is known.
 
     Attributes
     ----------
@@ -252,16 +255,16 @@ class Model:
         *,
         width: int = 0,
         layout: Layout | None = None,
-        delay: float = 0.0,
-        free_delay: bool = False,
-        free_lag: bool = False,
+        delay: float | None = None,
         seed: int = 0,
         longest_step: float | None = None,
     ) -> None:
-        self.plant, self.width, self.delay = plant, width, delay
+        self.plant, self.width = plant, width
+        self.delay = first_guess(plant.delay) if delay is None else delay
         self._made: dict[str, Any] = {"width": width, "layout": layout, "delay": delay}
-        self._made |= {"free_delay": free_delay, "free_lag": free_lag, "seed": seed}
-        self._made["longest_step"] = longest_step
+        self._made |= {"seed": seed, "longest_step": longest_step}
+        free_delay = delay is None and isinstance(plant.delay, Unknown)
+        free_lag = isinstance(plant.lag, Unknown)
         system = plant.system(1)
         self.d, self.m = len(plant.states), len(plant.inputs)
         known = compiled_known(PlantKey(plant))
@@ -325,6 +328,9 @@ class Model:
         places = dict(zip(self.names, self.named, strict=True))
         for name, at in zip(other.names, other.named, strict=True):
             out[places[name]] = p[at]
+        if "delay" in places and "delay" not in other.names[other.n_named :]:
+            assert isinstance(self.plant.delay, Unknown)
+            out[places["delay"]] = _deviations(self.plant.delay, other.delay)
         return out
 
     def values(self, p: Array) -> Values:
@@ -337,18 +343,19 @@ class Model:
             constants[at] = unknown.at(p[j])
             slopes[j] = unknown.slope(p[j])
         at = self.n_named + self.n_weights
-        delay = self.delay
-        if self.structure.free_delay:
-            delay += self.plant.dt * p[at]
-            at += 1
-        given = self.plant.lag
-        z = float(p[at]) if self.structure.free_lag else 0.0
-        lag = given.at(z) if isinstance(given, Unknown) else given
-        lag_slope = given.slope(z) if isinstance(given, Unknown) else 0.0
+        given = (
+            self.plant.delay if self.structure.free_delay else self.delay,
+            self.plant.lag,
+        )
+        times, time_slopes = [], []
+        for time in given:
+            z = float(p[at]) if isinstance(time, Unknown) else 0.0
+            at += isinstance(time, Unknown)
+            times.append(time.at(z) if isinstance(time, Unknown) else float(time))
+            time_slopes.append(time.slope(z) if isinstance(time, Unknown) else 0.0)
         weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
         sizes = np.ascontiguousarray(self.sizes)
-        numbers = (float(delay), float(lag), float(self.plant.dt), float(lag_slope))
-        return Values(constants, slopes, weights, sizes, *numbers)
+        return Values(constants, slopes, weights, sizes, *times, *time_slopes)
 
     def named_values(self, p: Array) -> tuple[dict[str, float], Array]:
         """Return the named parameters, and the derivative of each by its entry of p."""
@@ -397,6 +404,13 @@ class Model:
         return work_for(self.d, self.m, columns, *sizes)
 
 
+def _deviations(unknown: Unknown, number: float) -> float:
+    """Return by how many standard deviations a number is above the guess."""
+    if unknown.factor:
+        return math.log(number / unknown.value) / math.log(unknown.factor)
+    return (number - unknown.value) / unknown.spread
+
+
 def measured_names(plant: Plant) -> tuple[str, ...]:
     """Return the states that are measured, all where none is named."""
     return tuple(name for name in plant.states if name in plant.measured) or tuple(plant.states)
@@ -421,8 +435,8 @@ def rates_of(plant: Plant, measured: Sequence[int]) -> dict[int, tuple[int, floa
 def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | None = None) -> Data:
     """Return the pieces of logs one after the other.
 
-    With a linear hold each sample is divided into parts of constant input, so that the input is
-    interpolated between two rows; the rows in between have no measurement.
+    With a linear or cubic hold each sample is divided into parts, in each of which the input is the
+    mean of the line or curve through the rows; the rows in between have no measurement.
 
     Raises
     ------
@@ -432,7 +446,8 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
     if hold not in HOLDS:
         raise SpecificationError(
             f"hold is {hold!r}, but one of {', '.join(HOLDS)} is expected: choose 'zero' for "
-            f"inputs that are held between two rows, 'linear' for inputs that were measured."
+            f"inputs that are held between two rows, 'linear' for inputs that were measured, or "
+            f"'cubic' for smooth ones."
         )
     wanted = measured_names(plant)
     pieces: list[Piece] = []
@@ -458,7 +473,7 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
             )
         for piece in log.pieces:
             one = Piece(piece.time, piece.measured[:, columns], piece.inputs[:, given])
-            pieces.append(_interpolated(one) if hold == "linear" else one)
+            pieces.append(_interpolated(one, HOLDS[hold]) if HOLDS[hold] else one)
     pieces = [piece for piece in pieces if len(piece.time) > 1]
     if not pieces:
         raise SpecificationError(
@@ -488,13 +503,12 @@ def _first_deviations(plant: Plant, measured: Array) -> Array:
     return np.array(out)
 
 
-def _interpolated(piece: Piece) -> Piece:
+def _interpolated(piece: Piece, degree: int) -> Piece:
     t, y, u = piece
-    parts = max(2, math.ceil(float(np.median(np.diff(t))) / FINEST))
-    share = np.arange(parts) / parts
+    share = np.arange(PARTS) / PARTS
     time = np.concatenate([(t[:-1, None] + np.diff(t)[:, None] * share).ravel(), t[-1:]])
-    middle = (share + 0.5 / parts)[None, :, None]
-    between = u[:-1, None] + np.diff(u, axis=0)[:, None] * middle
+    whole = make_interp_spline(t, u, min(degree, len(t) - 1)).antiderivative()
+    means = np.diff(whole(time), axis=0) / np.diff(time)[:, None]
     measured = np.full((len(time), y.shape[1]), np.nan)
-    measured[::parts] = y
-    return Piece(time, measured, np.concatenate([between.reshape(-1, u.shape[1]), u[-1:]]))
+    measured[::PARTS] = y
+    return Piece(time, measured, np.concatenate([means, u[-1:]]))

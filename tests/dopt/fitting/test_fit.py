@@ -111,10 +111,9 @@ def test_a_simulation_agrees_with_scipy(delay: float, lag: float, jitter: float)
 def test_sensitivities_agree_with_differences(width: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     t, u = stamps(rng, 60, 0.3), rng.uniform(-2, 2, 60)
-    plant = pendulum(delay=dopt.unknown(0.0, spread=0.02), lag=dopt.unknown(0.03))
+    plant = pendulum(delay=dopt.unknown(0.0303, spread=0.02), lag=dopt.unknown(0.03))
     layout = Layout(np.array([0.0, 0.0, 0.5]), np.array([1.0, 1.0, 4.0]), np.array([9.0]))
-    how: dict[str, Any] = {"longest_step": 0.002, "delay": 0.0303, "width": width}
-    how |= {"free_delay": True, "free_lag": True, "layout": layout}
+    how: dict[str, Any] = {"longest_step": 0.002, "width": width, "layout": layout}
     sim = simulator(plant, t, np.zeros((60, 2)), u, **how)
     q, h = sim.model.q, 1e-5
     at = np.concatenate([sim.model.prior + 0.3 * rng.standard_normal(q), [0.4, 1.0]])
@@ -414,7 +413,7 @@ def test_units_of_a_state_do_not_matter() -> None:
     ("arguments", "said"),
     [
         ({"width": -1}, "width is -1, but a whole number of at least 0"),
-        ({"hold": "cubic"}, "hold is 'cubic'"),
+        ({"hold": "quintic"}, "hold is 'quintic', but one of zero, linear, cubic"),
         ({"window": 1e9}, "window is"),
         ({"weights": (0.0,), "width": 4}, "weights is"),
         ({"workers": 0}, "workers is 0"),
