@@ -40,6 +40,9 @@ FEEDBACK = 0.05
 PREDICTED = 0.9999
 """Share of an input that its past tells, above which feedback is not told apart."""
 
+FAR = 7.5
+"""What an input's past leaves open of a row, by its median, above which it jumps there."""
+
 ROOM = 1.5
 """Windows side by side for each feature of the state, below which too little is left to tell."""
 
@@ -48,6 +51,7 @@ Response = tuple[float, int, Vector]
 
 _LAG_BLOCKS = 16
 _PAST = 10  # samples of an input's past
+_TRIMMED = 6  # fits of it
 _RATE = re.compile(r"vel|rate|omega|speed|dot|^q?d[a-z]?\d*$", re.IGNORECASE)
 
 
@@ -276,7 +280,11 @@ def _steadiness(x: Vector, motion: Vector) -> float:
 
 
 def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
-    """Return what the state leaves open of an input, what it adds to its past, and the past."""
+    """Return what the state leaves open of an input, what it adds to its past, and the past.
+
+    Rows at which the input jumps, such as at steps of a set point, would hide what is fed back
+    between them: the last two are of the others.
+    """
     rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
     if not rows:
         return 1.0, 0.0, 0.0
@@ -284,9 +292,12 @@ def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
     if len(now) < 4 * (past.shape[1] + seen.shape[1]):
         return 1.0, 0.0, 0.0
     total = float(((now - now.mean()) ** 2).sum())
+    left = _left(np.column_stack([past[:, 0], seen]), now)[0] / total
+    usual = _usual(past, now)
+    now, past, seen = now[usual], past[usual], seen[usual]
+    total = float(((now - now.mean()) ** 2).sum())
     alone, n_alone = _left(past, now)
     both, n_both = _left(np.column_stack([past, seen]), now)
-    left = _left(np.column_stack([past[:, 0], seen]), now)[0] / total
     if alone <= 1e-12 * total:
         return left, 0.0, 1.0
     ratio = (both / (len(now) - n_both)) / (alone / (len(now) - n_alone))
@@ -309,6 +320,20 @@ def _causal(piece: Piece, j: int) -> tuple[Vector, Array, Array]:
     seen = np.column_stack([*recent, np.sin(state), np.cos(state)])
     there = np.isfinite(seen).all(axis=1)
     return now[there], past[there], seen[there]
+
+
+def _usual(features: Array, values: Vector) -> Booleans:
+    """Return the rows that features tell about as well as they tell most of these rows."""
+    scaled = features / np.maximum(np.sqrt((features**2).mean(axis=0)), 1e-300)
+    kept = np.ones(len(values), np.bool_)
+    for _ in range(_TRIMMED):
+        told = np.linalg.lstsq(scaled[kept], values[kept], rcond=1e-12)[0]
+        rest = np.abs(values - scaled @ told)
+        far = rest > FAR * np.median(rest[kept]) + 1e-12 * np.abs(values).max()
+        if (far != kept).all():
+            break
+        kept = ~far
+    return kept
 
 
 def _left(features: Array, values: Vector) -> tuple[float, int]:
