@@ -397,6 +397,62 @@ def test_the_report_says_whether_delay_and_lag_are_told_apart(
     assert delay + late == pytest.approx(0.02 + lag, abs=2e-3), "their sum is known in both cases"
 
 
+@pytest.mark.parametrize(
+    ("guess", "late"),
+    [
+        (dopt.unknown(0.0, spread=0.1), 0.18),  # beyond the first delays that are tried
+        (dopt.unknown(0.03, factor=3), 0.22),
+        (dopt.unknown(0.001), 0.02),  # earlier ones would be of the other sign
+    ],
+)
+def test_a_delay_is_found_as_far_as_it_was_declared_to_be(guess: Any, late: float) -> None:
+    table = run(0)
+    shifted = table.voltage.shift(-round((late - 0.02) / 0.02)).ffill()
+    found = dopt.fit(declared(delay=guess), table.assign(voltage=shifted), width=0)
+    value, error = found.constants["delay"]
+    assert abs(value - late) < 5 * error + 1e-4
+
+
+def test_a_delay_keeps_its_prior_as_other_constants_do() -> None:
+    """Its spread was that of one sample, whatever was declared."""
+    for declared_delay in (dopt.unknown(0.05, spread=1e-6), dopt.unknown(0.05, factor=1.00001)):
+        found = dopt.fit(declared(delay=declared_delay), run(0, 600), width=0, window=0.6)
+        assert found.constants["delay"][0] == pytest.approx(0.05, rel=0.01)
+
+
+@pytest.mark.parametrize("hold", ["linear", "cubic"])
+def test_what_a_smooth_input_does_between_rows_is_said(hold: str) -> None:
+    """A mass on a spring over a road; by lines the spring was 20 errors off without a word."""
+    rng, t = np.random.default_rng(0), np.arange(4000.0) * 0.01
+    frequencies, phases = rng.uniform(0.5, 6, 12), rng.uniform(0, 6, 12)
+
+    def road(s: float) -> Any:
+        return np.sin(2 * math.pi * frequencies * s + phases).sum() / 5
+
+    def rate(s: float, x: Array) -> list[float]:
+        return [x[1], 200 * (road(s) - x[0]) - 3 * x[1]]
+
+    x = solve_ivp(rate, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
+    plant = dopt.Plant(
+        states={"height": "m", "speed": "m/s"},
+        inputs={"road": "m"},
+        dt=0.01,
+        gamma=2.0,
+        known={"height": "speed", "speed": "spring * (road - height) - damping * speed"},
+        constants={"spring": dopt.unknown(150.0), "damping": dopt.unknown(2.0)},
+        learned=["speed"],
+        box={"speed": 10.0},
+        measured={"height": 1e-3},
+    )
+    table = {"t": t, "height": x + 1e-3 * rng.normal(size=4000), "road": [*map(road, t)]}
+    found = dopt.fit(plant, table, width=0, hold=hold, window=0.5)
+    errors = {"spring": 200.0, "damping": 3.0}
+    off = max(
+        abs(found.constants[name][0] - v) / found.constants[name][1] for name, v in errors.items()
+    )
+    assert (off > 5) == ("take hold='cubic'" in found.report()) == (hold == "linear")
+
+
 def test_units_of_a_state_do_not_matter() -> None:
     table, results = run(6, 600), []
     for unit in (1.0, 8.0, 1000.0):
