@@ -134,12 +134,13 @@ class Exploration(Protocol):
     states: Array
     excess: Array
     answer: Array | None
-    flight: Flight
     was_asked: bool
     system: System
 
     @property
     def steps(self) -> Steps: ...
+    @property
+    def flight(self) -> Flight: ...
 
 
 class Signs:

@@ -1,8 +1,8 @@
 """A plant fitted to logs: windows, delay, network and weight of the data chosen by validation.
 
 1. The unknown constants are fitted to short windows, with each delay from two samples too early to
-   three too late (or as late as an unknown one may be), and then to longer ones. The length of windows that predicts held-out blocks best
-   is kept.
+   three too late, or later while that fits better, and then to longer ones. The length of windows
+   that predicts held-out blocks best is kept.
 2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
 3. A level is looked for at which the inputs are cut before they act. Where it predicts the held-out

@@ -499,6 +499,31 @@ def test_states_that_are_measured_at_different_times_are_judged() -> None:
     assert min(found.coverage().values()) > 0.7
 
 
+def test_a_state_that_hardly_moves_within_the_noise_is_not_judged_there() -> None:
+    """A model without a fault was called no better than that nothing changes."""
+    table = run(3)
+    rng, drift = np.random.default_rng(0), 0.02 * np.cumsum(np.sin(table.angle)) * 0.02
+    table["level"] = drift + 0.01 * rng.normal(size=len(table))
+    plant = declared(
+        states={"angle": "rad", "rate": "rad/s", "level": "m"},
+        known={**declared().known, "level": "slow * sin(angle)"},
+        constants={**declared().constants, "slow": dopt.unknown(0.01)},
+        measured={"angle": dopt.encoder(4096), "level": 0.01},
+    )
+    assert dopt.fit(plant, table, width=0).verdict().startswith("Useful up to")
+
+
+def test_errors_grow_on_beyond_the_last_horizon() -> None:
+    """Bounds of an angle that nothing pulls back held a quarter of a long run."""
+    seconds, noise = np.array([0.0, 0.5, 4.0, 16.0, 64.0]), np.array([0.01, 0.5])
+    steps = np.arange(1, 41) * 0.1
+    error = np.column_stack([0.02 * np.sqrt(steps), 0.1 * np.ones(40)])
+    made = problem.Predicted([steps] * 3, [error] * 3, [np.ones((40, 2))] * 3, np.ones(2))
+    found = problem.errors_ahead([made], [1.0, 2.0, 4.0], seconds, noise)
+    np.testing.assert_allclose(found[2:, 0], 0.02 * np.sqrt(seconds[2:]))
+    np.testing.assert_array_equal(found[:, 1], 0.5)
+
+
 def test_short_runs_are_judged_as_far_as_they_go() -> None:
     """A block alone has no other ones that bound it; a run of one window is predicted."""
     other = run(1)
