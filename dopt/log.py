@@ -400,12 +400,6 @@ class Log:
         If a column is missing, is no column of numbers, or no two rows can be used.
     """
 
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    pieces: tuple[Piece, ...]
-    notes: tuple[str, ...]
-    left_out: tuple[Booleans, ...]
-
     def __init__(
         self,
         data: Any,
@@ -509,20 +503,18 @@ class Log:
 
     @classmethod
     def of_pieces(
-        cls, states: Sequence[str], inputs: Sequence[str], pieces: Sequence[Piece]
+        cls,
+        states: Sequence[str],
+        inputs: Sequence[str],
+        pieces: Sequence[Piece],
+        left_out: Sequence[Booleans] | None = None,
     ) -> Log:
         """Return the log of pieces that are as :class:`Piece` describes."""
         log = cls.__new__(cls)
         log.states, log.inputs = tuple(states), tuple(inputs)
         log.pieces, log.notes = tuple(pieces), ()
-        log.left_out = tuple(np.zeros(piece.measured.shape, np.bool_) for piece in pieces)
-        return log
-
-    def stretch(self, number: int, rows: slice) -> Log:
-        """Return some rows of a piece as a log."""
-        piece = Piece(*(part[rows] for part in self.pieces[number]))
-        log = Log.of_pieces(self.states, self.inputs, [piece])
-        log.left_out = (self.left_out[number][rows],)
+        none = (np.zeros(piece.measured.shape, np.bool_) for piece in pieces)
+        log.left_out = tuple(none if left_out is None else left_out)
         return log
 
     @property

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Array
+
+if TYPE_CHECKING:
+    from dopt.explorer.state import InFlight
 
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
@@ -119,13 +123,6 @@ class Steps(Protocol):
     def parameters(self) -> Array: ...
 
 
-class Flight(Protocol):
-    """What is read of inputs on their way."""
-
-    @property
-    def waiting(self) -> Array: ...
-
-
 class Exploration(Protocol):
     """What is read of a state of an exploration, except for the counts, which are changed."""
 
@@ -140,7 +137,7 @@ class Exploration(Protocol):
     @property
     def steps(self) -> Steps: ...
     @property
-    def flight(self) -> Flight: ...
+    def flight(self) -> InFlight: ...
 
 
 class Signs:
@@ -220,7 +217,8 @@ class Signs:
             if sum(len(errors) for errors, *_ in self._rows) >= fewest:
                 *rows, later = zip(*self._rows, strict=True)
                 n = min(part.shape[-1] for part in later)
-                self._test(state, *map(np.concatenate, (*rows, [part[..., :n] for part in later])))
+                rows.append(tuple(part[..., :n] for part in later))
+                self._test(state, [*map(np.concatenate, rows)])
                 self._rows = []
 
     def _compare_runs(self, state: Exploration) -> None:
@@ -299,16 +297,9 @@ class Signs:
             following = predict(system, accelerations, x[:-1], u[:, None])[0]
             return (moved - (following - x[:-1]) / system.dt)[:, rows], moved[:, rows]
 
-    def _test(
-        self,
-        state: Exploration,
-        errors: Array,
-        moved: Array,
-        given: Array,
-        earlier: Array,
-        later: Array,
-    ) -> None:
+    def _test(self, state: Exploration, rows: Sequence[Array]) -> None:
         """Count where inputs of earlier steps explain errors, or ones that are not to act yet."""
+        errors, moved, given, earlier, later = rows
         if not (np.isfinite(errors).all() and np.isfinite(given).all()):
             return
         largest, said = 0.0, ("", 0)

@@ -76,9 +76,7 @@ class State(NamedTuple):
     @property
     def constants(self) -> dict[str, tuple[float, float]]:
         """Value and expected standard error of each unknown constant, of delay and lag [s]."""
-        values, slopes = self.model.named_values(self.p)
-        errors = np.abs(slopes) * np.sqrt(np.diag(self.covariance)[self.model.named])
-        return dict(zip(values, zip(values.values(), errors.tolist(), strict=True), strict=True))
+        return self.model.with_errors(self.p, self.covariance)
 
 
 @dataclass(frozen=True)
@@ -290,12 +288,14 @@ def segments_of(plant: Plant, logs: Sequence[Log], seconds: float) -> tuple[list
     for number, log in enumerate(logs):
         step = log.step
         lead, tail = (margin + step for margin in _margins(plant, step))
-        for piece, (time, *_) in enumerate(log.pieces) if seconds > 2 * step else ():
+        both = zip(log.pieces, log.left_out, strict=True) if seconds > 2 * step else ()
+        for (time, measured, inputs), lost in both:
             begin = time[0] + lead
             while begin + seconds + tail <= time[-1]:
                 ends = begin - lead - 0.5 * step, begin + seconds + tail + 0.5 * step
                 rows = slice(*np.searchsorted(time, ends))
-                out.append(log.stretch(piece, rows))
+                piece = Piece(time[rows], measured[rows], inputs[rows])
+                out.append(Log.of_pieces(log.states, log.inputs, [piece], [lost[rows]]))
                 places.append(f"log {number}, {begin:.6g} to {begin + seconds:.6g} s")
                 begin += seconds
     if not out:

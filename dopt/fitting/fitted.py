@@ -128,13 +128,7 @@ class Fitted:
 
     @functools.cached_property
     def constants(self) -> dict[str, tuple[float, float]]:
-        model, solution, _, covariance = self.physics
-        values, slopes = model.named_values(solution.p)
-        deviations = np.abs(slopes) * np.sqrt(np.diag(covariance)[model.named])
-        return {
-            name: (value, float(error))
-            for (name, value), error in zip(values.items(), deviations, strict=True)
-        }
+        return self.physics.model.with_errors(self.physics.solution.p, self.physics.covariance)
 
     def _delay_and_lag(self) -> str:
         """Return in a sentence whether the data tell the delay from the lag.

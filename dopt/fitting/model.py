@@ -23,7 +23,7 @@ from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values, Work, 
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
-from dopt.systems.expressions import FUNCTIONS, compiled_text
+from dopt.systems.expressions import FUNCTIONS
 from dopt.systems.plant import Encoder, Plant, Unknown, first_guess
 from dopt.types import Array, Booleans, CompiledFunction, Equation, Integers, NumbaType
 
@@ -180,20 +180,20 @@ class Known(NamedTuple):
     values: CompiledFunction  # (x, v, c, f)
     derivatives: CompiledFunction  # (x, v, c, f, G), with G of Work
     driven: Integers  # rows that constants or inputs change
-    equation: Equation
+
+
+Names = tuple[str, ...]
 
 
 @functools.lru_cache(maxsize=64)
-def compiled_known(key: PlantKey) -> Known:
+def compiled_known(
+    texts: Names, states: Names, inputs: Names, constants: Names, unknown: Names
+) -> Known:
     """Compile the known part of a plant, and its derivatives."""
-    plant = key.plant
-    groups = {"states": [*plant.states], "inputs": [*plant.inputs], "constants": [*plant.constants]}
-    texts = {f"known['{name}']": plant.known.get(name, "0.0") for name in plant.states}
-    equation = compiled_text(texts, groups, plant.guesses)
-    by = [*plant.states, *plant.inputs, *unknown_of(plant)]
-    values, _ = differentiated_text([*texts.values()], groups, [])
-    derivatives, where = differentiated_text([*texts.values()], groups, by)
-    driven = np.flatnonzero(where[:, len(plant.states) :].any(axis=1))
+    groups = {"states": states, "inputs": inputs, "constants": constants}
+    values, _ = differentiated_text(texts, groups, [])
+    derivatives, where = differentiated_text(texts, groups, [*states, *inputs, *unknown])
+    driven = np.flatnonzero(where[:, len(states) :].any(axis=1))
 
     def compiled(function: CompiledFunction, signature: NumbaType) -> CompiledFunction:
         if PLAIN:
@@ -203,27 +203,12 @@ def compiled_known(key: PlantKey) -> Known:
         code.disable_compile()
         return code
 
-    return Known(compiled(values, KNOWN), compiled(derivatives, DERIVATIVES), driven, equation)
+    return Known(compiled(values, KNOWN), compiled(derivatives, DERIVATIVES), driven)
 
 
 def unknown_of(plant: Plant) -> dict[str, Unknown]:
     """Return the unknown constants of a plant."""
     return {k: v for k, v in plant.constants.items() if isinstance(v, Unknown)}
-
-
-class PlantKey:
-    """A plant as the key of a cache: equal where its known part is."""
-
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
-        groups = (plant.states, plant.inputs, plant.constants, unknown_of(plant))
-        self._key = (*map(tuple, groups), tuple(plant.known.items()))
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, PlantKey) and self._key == other._key
 
 
 class Layout(NamedTuple):
@@ -261,14 +246,15 @@ class Model:
     ) -> None:
         self.plant, self.width = plant, width
         self.delay = first_guess(plant.delay) if delay is None else delay
-        self._made: dict[str, Any] = {"width": width, "layout": layout, "delay": delay}
-        self._made |= {"seed": seed, "longest_step": longest_step}
-        free_delay = delay is None and isinstance(plant.delay, Unknown)
-        free_lag = isinstance(plant.lag, Unknown)
+        options: dict[str, Any] = {"delay": delay, "longest_step": longest_step, "seed": seed}
+        self._made = functools.partial(Model, plant, width=width, layout=layout, **options)
+        times = {"delay": plant.delay if delay is None else delay, "lag": plant.lag}
+        free = [name for name, value in times.items() if isinstance(value, Unknown)]
         system = plant.system(1)
         self.d, self.m = len(plant.states), len(plant.inputs)
-        known = compiled_known(PlantKey(plant))
-        self.equation, self.unknown = known.equation, unknown_of(plant)
+        self.equation, self.unknown = system.known, unknown_of(plant)
+        names = map(tuple, (plant.states, plant.inputs, plant.constants, self.unknown))
+        known = compiled_known(tuple(plant.known.get(n, "0.0") for n in plant.states), *names)
         places = [i for i, name in enumerate(plant.constants) if name in self.unknown]
         features = system.features
         p, r = len(features), len(system.learned_rows)
@@ -289,8 +275,8 @@ class Model:
             feature_scales=layout.scales,
             measured=np.array(measured, np.int64),
             width=width,
-            free_delay=free_delay,
-            free_lag=free_lag,
+            free_delay="delay" in free,
+            free_lag="lag" in free,
             longest_step=longest_step or plant.dt,
             limits=limits,
         )
@@ -302,11 +288,10 @@ class Model:
         inner = rng.standard_normal((width, p)).T.ravel(), rng.standard_normal(width)
         weights[: (p + 1) * width] = np.concatenate(inner)  # the output layer begins at zero
         self.n_named, self.n_weights = len(places), n_weights
-        times = np.zeros(int(free_delay) + int(free_lag))
-        self.prior = np.concatenate([np.zeros(len(places)), weights, times])
-        last = ["delay"] * free_delay + ["lag"] * free_lag
-        self.names = (*self.unknown, *last)
-        self.named = [*range(len(places)), *range(len(self.prior) - len(times), len(self.prior))]
+        self.prior = np.concatenate([np.zeros(len(places)), weights, np.zeros(len(free))])
+        self.names = (*self.unknown, *free)
+        self._times = {name: len(places) + n_weights + i for i, name in enumerate(free)}
+        self.named = [*range(len(places)), *self._times.values()]
 
     @property
     def q(self) -> int:
@@ -315,22 +300,19 @@ class Model:
 
     def with_network(self, width: int, layout: Layout, seed: int) -> Model:
         """Return the same model with a network beside the known part."""
-        changed = {"width": width, "layout": layout, "seed": seed}
-        return Model(self.plant, **self._made | changed)
+        return self._made(width=width, layout=layout, seed=seed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the model is made of, and not what is compiled for it."""
-        return functools.partial(Model, self.plant, **self._made), ()
+        return self._made, ()
 
     def extended(self, p: Array, other: Model) -> Array:
         """Return the parameters of another model without a network in the places of this one."""
         out = self.prior.copy()
-        places = dict(zip(self.names, self.named, strict=True))
-        for name, at in zip(other.names, other.named, strict=True):
-            out[places[name]] = p[at]
-        if "delay" in places and "delay" not in other.names[other.n_named :]:
-            assert isinstance(self.plant.delay, Unknown)
-            out[places["delay"]] = _deviations(self.plant.delay, other.delay)
+        out[: self.n_named] = p[: self.n_named]
+        for name, at in self._times.items():
+            known = name not in other._times
+            out[at] = _deviations(self.plant.delay, other.delay) if known else p[other._times[name]]
         return out
 
     def values(self, p: Array) -> Values:
@@ -342,20 +324,15 @@ class Model:
         ):
             constants[at] = unknown.at(p[j])
             slopes[j] = unknown.slope(p[j])
-        at = self.n_named + self.n_weights
-        given = (
-            self.plant.delay if self.structure.free_delay else self.delay,
-            self.plant.lag,
-        )
-        times, time_slopes = [], []
-        for time in given:
-            z = float(p[at]) if isinstance(time, Unknown) else 0.0
-            at += isinstance(time, Unknown)
-            times.append(time.at(z) if isinstance(time, Unknown) else float(time))
-            time_slopes.append(time.slope(z) if isinstance(time, Unknown) else 0.0)
+        numbers = [float(self.delay), float(first_guess(self.plant.lag)), 0.0, 0.0]
+        for i, name in enumerate(("delay", "lag")):
+            time = getattr(self.plant, name)
+            if name in self._times:
+                z = float(p[self._times[name]])
+                numbers[i], numbers[2 + i] = time.at(z), time.slope(z)
         weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
         sizes = np.ascontiguousarray(self.sizes)
-        return Values(constants, slopes, weights, sizes, *times, *time_slopes)
+        return Values(constants, slopes, weights, sizes, *numbers)
 
     def named_values(self, p: Array) -> tuple[dict[str, float], Array]:
         """Return the named parameters, and the derivative of each by its entry of p."""
@@ -364,14 +341,15 @@ class Model:
             name: float(values.constants[at])
             for name, at in zip(self.unknown, self.structure.unknown, strict=True)
         }
-        slopes = [*values.slopes]
-        if self.structure.free_delay:
-            found["delay"] = values.delay
-            slopes.append(values.delay_slope)
-        if self.structure.free_lag:
-            found["lag"] = values.lag
-            slopes.append(values.lag_slope)
-        return found, np.array(slopes)
+        found |= {name: float(getattr(values, name)) for name in self._times}
+        times = [getattr(values, f"{name}_slope") for name in self._times]
+        return found, np.array([*values.slopes, *times])
+
+    def with_errors(self, p: Array, covariance: Array) -> dict[str, tuple[float, float]]:
+        """Return value and standard error of each named parameter, by the covariance of p."""
+        values, slopes = self.named_values(p)
+        errors = np.abs(slopes) * np.sqrt(np.diag(covariance)[self.named])
+        return dict(zip(values, zip(values.values(), errors.tolist(), strict=True), strict=True))
 
     def derivative(self, p: Array, states: Array, inputs: Array) -> Array:
         """Return dx/dt, (N, d), at states, (N, d), under inputs that act, (N, m)."""
@@ -404,11 +382,11 @@ class Model:
         return work_for(self.d, self.m, columns, *sizes)
 
 
-def _deviations(unknown: Unknown, number: float) -> float:
+def _deviations(unknown: Any, number: float) -> float:
     """Return by how many standard deviations a number is above the guess."""
     if unknown.factor:
-        return math.log(number / unknown.value) / math.log(unknown.factor)
-    return (number - unknown.value) / unknown.spread
+        return math.log(number / unknown.value, unknown.factor)
+    return float(number - unknown.value) / float(unknown.spread)
 
 
 def measured_names(plant: Plant) -> tuple[str, ...]:
