@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dopt.errors import SpecificationError, suggestion, unknown_name
-from dopt.types import Array, Booleans
+from dopt.types import Array, Booleans, Integers
 
 if TYPE_CHECKING:
     from dopt.systems.plant import Plant
@@ -503,18 +503,13 @@ class Log:
 
     @classmethod
     def of_pieces(
-        cls,
-        states: Sequence[str],
-        inputs: Sequence[str],
-        pieces: Sequence[Piece],
-        left_out: Sequence[Booleans] | None = None,
+        cls, states: Sequence[str], inputs: Sequence[str], pieces: Sequence[Piece]
     ) -> Log:
         """Return the log of pieces that are as :class:`Piece` describes."""
         log = cls.__new__(cls)
         log.states, log.inputs = tuple(states), tuple(inputs)
         log.pieces, log.notes = tuple(pieces), ()
-        none = (np.zeros(piece.measured.shape, np.bool_) for piece in pieces)
-        log.left_out = tuple(none if left_out is None else left_out)
+        log.left_out = tuple(np.zeros(piece.measured.shape, np.bool_) for piece in pieces)
         return log
 
     @property
@@ -679,9 +674,7 @@ def outliers(y: Array, period: float) -> Booleans:
     return np.asarray(apart > np.maximum(usual, across))
 
 
-def _leave_out(
-    name: str, y: Array, pieces: Rows, period: float, notes: list[str]
-) -> npt.NDArray[np.intp]:
+def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> Integers:
     """Write NaN in the place of the outliers of a measured state, and return their rows."""
     there = [each[np.isfinite(y[each])] for each in pieces]
     found = [each[outliers(y[each], period)] for each in there if len(each) >= NEAR]

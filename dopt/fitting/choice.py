@@ -295,7 +295,8 @@ def segments_of(plant: Plant, logs: Sequence[Log], seconds: float) -> tuple[list
                 ends = begin - lead - 0.5 * step, begin + seconds + tail + 0.5 * step
                 rows = slice(*np.searchsorted(time, ends))
                 piece = Piece(time[rows], measured[rows], inputs[rows])
-                out.append(Log.of_pieces(log.states, log.inputs, [piece], [lost[rows]]))
+                out.append(Log.of_pieces(log.states, log.inputs, [piece]))
+                out[-1].left_out = (lost[rows],)
                 places.append(f"log {number}, {begin:.6g} to {begin + seconds:.6g} s")
                 begin += seconds
     if not out:
