@@ -37,8 +37,17 @@ STEADY = 4.5
 FEEDBACK = 0.05
 """Share of what an input's past leaves open that measurements explain, above which there is one."""
 
+OF_INPUT = 0.002
+"""Its least share of the input: a torque that was measured depends on the velocity a little."""
+
+BETWEEN = 0.3
+"""Share of what is left open between jumps, above which these hide the feedback, however small."""
+
 PREDICTED = 0.9999
 """Share of an input that its past tells, above which feedback is not told apart."""
+
+FAR = 7.5
+"""What an input's past leaves open of a row, by its median, above which it jumps there."""
 
 ROOM = 1.5
 """Windows side by side for each feature of the state, below which too little is left to tell."""
@@ -48,6 +57,7 @@ Response = tuple[float, int, Vector]
 
 _LAG_BLOCKS = 16
 _PAST = 10  # samples of an input's past
+_TRIMMED = 6  # fits of it
 _RATE = re.compile(r"vel|rate|omega|speed|dot|^q?d[a-z]?\d*$", re.IGNORECASE)
 
 
@@ -101,8 +111,9 @@ class Effect:
     @property
     def closed_loop(self) -> bool:
         """Whether the input answers to the measurements."""
-        feedback = self.feedback > FEEDBACK and self.predicted < PREDICTED
-        return self.follows_state or feedback
+        is_large = self.feedback * (1.0 - self.predicted) > OF_INPUT
+        feedback = self.feedback > (FEEDBACK if is_large else BETWEEN)
+        return self.follows_state or (feedback and self.predicted < PREDICTED)
 
 
 def effects(log: Log) -> list[Effect]:
@@ -276,21 +287,33 @@ def _steadiness(x: Vector, motion: Vector) -> float:
 
 
 def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
-    """Return what the state leaves open of an input, what it adds to its past, and the past."""
+    """Return what the state leaves open of an input, what it adds to its past, and the past.
+
+    Jumps of the input, such as at steps of a set point, may hide what is fed back between them. The
+    last two are of the rows between them where much is.
+    """
     rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
     if not rows:
         return 1.0, 0.0, 0.0
     now, past, seen = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     if len(now) < 4 * (past.shape[1] + seen.shape[1]):
         return 1.0, 0.0, 0.0
+    left = _left(np.column_stack([past[:, 0], seen]), now)[0]
+    usual = _usual(past, now)
+    between = _feedback(past[usual], seen[usual], now[usual])
+    found = between if between[0] > BETWEEN else _feedback(past, seen, now)
+    return left / float(((now - now.mean()) ** 2).sum()), *found
+
+
+def _feedback(past: Array, seen: Array, now: Vector) -> tuple[float, float]:
+    """Return what measurements explain of what the past leaves open, and what the past tells."""
     total = float(((now - now.mean()) ** 2).sum())
     alone, n_alone = _left(past, now)
-    both, n_both = _left(np.column_stack([past, seen]), now)
-    left = _left(np.column_stack([past[:, 0], seen]), now)[0] / total
     if alone <= 1e-12 * total:
-        return left, 0.0, 1.0
+        return 0.0, 1.0
+    both, n_both = _left(np.column_stack([past, seen]), now)
     ratio = (both / (len(now) - n_both)) / (alone / (len(now) - n_alone))
-    return left, max(0.0, 1.0 - ratio), 1.0 - alone / total
+    return max(0.0, 1.0 - ratio), 1.0 - alone / total
 
 
 def _causal(piece: Piece, j: int) -> tuple[Vector, Array, Array]:
@@ -309,6 +332,20 @@ def _causal(piece: Piece, j: int) -> tuple[Vector, Array, Array]:
     seen = np.column_stack([*recent, np.sin(state), np.cos(state)])
     there = np.isfinite(seen).all(axis=1)
     return now[there], past[there], seen[there]
+
+
+def _usual(features: Array, values: Vector) -> Booleans:
+    """Return the rows that features tell about as well as they tell most of these rows."""
+    scaled = features / np.maximum(np.sqrt((features**2).mean(axis=0)), 1e-300)
+    kept = np.ones(len(values), np.bool_)
+    for _ in range(_TRIMMED):
+        told = np.linalg.lstsq(scaled[kept], values[kept], rcond=1e-12)[0]
+        rest = np.abs(values - scaled @ told)
+        far = rest > FAR * np.median(rest[kept]) + 1e-12 * np.abs(values).max()
+        if (far != kept).all():
+            break
+        kept = ~far
+    return kept
 
 
 def _left(features: Array, values: Vector) -> tuple[float, int]:

@@ -500,7 +500,10 @@ def add_fit_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
     command.add_argument("--width", type=int, default=16, help="units of the network, 0: none (16)")
     command.add_argument(
-        "--hold", choices=("zero", "linear"), default="zero", help="input between two rows (zero)"
+        "--hold",
+        choices=("zero", "linear", "cubic"),
+        default="zero",
+        help="input between two rows (zero)",
     )
     command.add_argument("--window", type=positive("--window", float), help="window [s] (chosen)")
     command.add_argument("--out", type=path("--out"), default="fit", help="folder (fit/)")

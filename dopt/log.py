@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dopt.errors import SpecificationError, suggestion, unknown_name
-from dopt.types import Array, Booleans
+from dopt.types import Array, Booleans, Integers
 
 if TYPE_CHECKING:
     from dopt.systems.plant import Plant
@@ -391,20 +391,14 @@ class Log:
         Stretches without gaps, of two rows or more.
     notes : tuple of str
         One sentence for each thing that was done or found.
-    outliers : Counter of str
-        Measurements that were left out as outliers, by state.
+    left_out : tuple of (N, n) arrays
+        Which measurements of each piece were left out as outliers.
 
     Raises
     ------
     SpecificationError
         If a column is missing, is no column of numbers, or no two rows can be used.
     """
-
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    pieces: tuple[Piece, ...]
-    notes: tuple[str, ...]
-    outliers: Counter[str]
 
     def __init__(
         self,
@@ -437,12 +431,13 @@ class Log:
         _note_missing(self.states, measured, notes)
         usable = np.isfinite(stamps) & np.isfinite(applied).all(axis=1)
         rows = _without_gaps(stamps, usable, gap, notes)
-        self.outliers = Counter()
+        lost = np.zeros(measured.shape, np.bool_)
         for i, name in enumerate(self.states):
             if name in angles:
-                self.outliers[name] += _leave_out(name, measured[:, i], rows, TURN, notes)
+                lost[_leave_out(name, measured[:, i], rows, TURN, notes), i] = True
                 measured[:, i] = _unwrapped(name, measured[:, i], rows, notes)
-            self.outliers[name] += _leave_out(name, measured[:, i], rows, math.inf, notes)
+            lost[_leave_out(name, measured[:, i], rows, math.inf, notes), i] = True
+        self.left_out = tuple(lost[k] for k in rows)
         start = stamps[rows[0][0]]
         if start:
             notes.append(f"Times count from the first usable stamp, {start:.10g} s.")
@@ -513,8 +508,15 @@ class Log:
         """Return the log of pieces that are as :class:`Piece` describes."""
         log = cls.__new__(cls)
         log.states, log.inputs = tuple(states), tuple(inputs)
-        log.pieces, log.notes, log.outliers = tuple(pieces), (), Counter()
+        log.pieces, log.notes = tuple(pieces), ()
+        log.left_out = tuple(np.zeros(piece.measured.shape, np.bool_) for piece in pieces)
         return log
+
+    @property
+    def outliers(self) -> Counter[str]:
+        """Measurements that were left out as outliers, by state."""
+        counts = np.sum([lost.sum(axis=0) for lost in self.left_out], axis=0)
+        return Counter(dict(zip(self.states, counts.tolist(), strict=True)))
 
     @property
     def n_rows(self) -> int:
@@ -672,16 +674,16 @@ def outliers(y: Array, period: float) -> Booleans:
     return np.asarray(apart > np.maximum(usual, across))
 
 
-def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> int:
-    """Write NaN in the place of the outliers of a measured state, and return their number."""
+def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> Integers:
+    """Write NaN in the place of the outliers of a measured state, and return their rows."""
     there = [each[np.isfinite(y[each])] for each in pieces]
     found = [each[outliers(y[each], period)] for each in there if len(each) >= NEAR]
     rows = np.concatenate([*found, np.empty(0, np.intp)])
     if not 0 < len(rows) <= MOST_OUTLIERS * len(y):
-        return 0
+        return rows[:0]
     notes.append(f"{count_text(len(rows), 'outlier')} of {name} left out, first row {rows[0]}.")
     y[rows] = np.nan
-    return len(rows)
+    return rows
 
 
 def _note_missing(names: Sequence[str], measured: Array, notes: list[str]) -> None:

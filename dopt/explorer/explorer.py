@@ -98,6 +98,8 @@ class Explorer(Explored):
     ``late``
         stretches of 300 steps whose errors, or changes of what is measured with noise, follow from
         inputs of earlier steps: a delay or a lag that was not declared
+    ``early``
+        such stretches that follow from inputs that are not to act yet: too long a delay is declared
     ``worse``
         tests, every 500 steps, in which the learned model predicted the last ones 50 at a time with
         1.25 times the error of the known part alone, or more
@@ -112,7 +114,7 @@ class Explorer(Explored):
     ``narrow``
         sides of the box of which the first 500 states cover less than a tenth
 
-    Each of the last eight is also said once, by a warning.
+    Each of the last nine is also said once, by a warning.
 
     Of a plant some of whose states are measured with noise (``Plant(measured=...)``), :meth:`ask`
     and :meth:`tell` are given these states, (n,), in the order of all, in their place; the learner

@@ -2,9 +2,10 @@
 
 Errors are of accelerations, with their signs, by parameters at most 50 steps old. For each learned
 row and each input the share of their squares is taken that the input of the eight steps before
-explains, beyond a constant, the features of x_t and the inputs u_t, on which alone a plant depends
-that answers at once. Estimated states depend on earlier inputs by their filter: where they are,
-second differences of the measurements take the place of errors, and u_{t-1} is given as well.
+explains, or the inputs that do not act yet as the delay is declared, beyond a constant, the
+features of x_t and the inputs u_t, on which alone a plant depends that answers at once. Estimated
+states depend on earlier inputs by their filter: where they are, second differences of the
+measurements take the place of errors, and u_{t-1} is given as well.
 
 Free runs over the last steps are predicted by the learned model, and by the known part alone. Where
 a low-pass filter estimates the states, they begin, end and are driven as it has them, late alike.
@@ -18,8 +19,8 @@ from __future__ import annotations
 import functools
 import logging
 from collections import Counter, deque
-from collections.abc import Iterator
-from typing import Any, Protocol
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -32,9 +33,13 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Array
 
+if TYPE_CHECKING:
+    from dopt.explorer.state import InFlight
+
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
     "late": "stretches of 300 steps whose errors follow from earlier inputs",
+    "early": "stretches of 300 steps whose errors follow from inputs that are not to act yet",
     "worse": "tests in which the learned model predicted worse than the known part alone",
     "altered": "learned steps in which another input was applied than was asked",
     "supply": "fits that found a level beyond which inputs act no more",
@@ -94,6 +99,10 @@ _TEXTS = {
     "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
     "once, or as declared: declare Plant(delay=..., lag=...), or let learner='simulation_error' "
     "fit them (dopt.unknown)",
+    "early": "the errors of the predictions follow from inputs that are not to act yet, most from "
+    "the one %d samples before (together %.0f %% of their squares), but the plant is expected to "
+    "answer as late as declared: declare a shorter delay, or let learner='simulation_error' fit it "
+    "(dopt.unknown)",
     "worse": "%d steps ahead the learned model predicts with %.3g times the error of the known "
     "part alone, but it is expected to help: let 'joint_ekf' or 'simulation_error' learn, which "
     "estimate states, or raise velocity_cutoff or the noise variance",
@@ -134,6 +143,8 @@ class Exploration(Protocol):
 
     @property
     def steps(self) -> Steps: ...
+    @property
+    def flight(self) -> InFlight: ...
 
 
 class Signs:
@@ -150,7 +161,7 @@ class Signs:
         self._parameters: Array | None = None  # at the beginning of the block
         self._still = 0  # blocks in a row that left them as they were
         self._start = 0  # first of the steps that followed each other
-        self._steps: list[tuple[int, float, Any]] = []  # start, time and measurement of each step
+        self._steps: list[tuple[int, float, Any, Array]] = []  # start, time, measurement, waiting
         self._models: list[Array] = []  # parameters at the beginning of each block of them
         self._rows: list[tuple[Array, ...]] = []  # of the next test
         self._starts: list[int] = []  # of the last steps
@@ -170,7 +181,7 @@ class Signs:
             state.counts["beyond"] += 1
             if limits.enforced:
                 self._say("beyond", state.excess[done - 1], done)
-        self._steps.append((self._start, seconds, event["learn"]))
+        self._steps.append((self._start, seconds, event["learn"], state.flight.waiting))
         self._starts.append(self._start)
         if done % BLOCK == 0:
             self._end_block(state)
@@ -260,17 +271,19 @@ class Signs:
             self._say("worse", AHEAD, learned / known)
 
     def _test_inputs(
-        self, state: Exploration, steps: list[tuple[int, float, Any]], models: list[Array]
+        self, state: Exploration, steps: Sequence[tuple[Any, ...]], models: Sequence[Array]
     ) -> Iterator[None]:
         """Count where inputs of earlier steps explain errors, once there are enough of these.
 
-        What is given (N, p) and the earlier inputs (N, m, L) are taken beside the errors (N, r) and
-        the accelerations (N, r) of the last steps, where these follow others without a gap.
+        What is given (N, p), the earlier inputs and those that do not act yet, from the newest on,
+        (N, m, L) each, are taken beside the errors (N, r) and the accelerations (N, r) of the last
+        steps, where these follow others without a gap.
         """
         found, first, inputs = scaled(state.system), state.done - TESTED, state.steps.inputs
         x, u = state.steps.states[first : state.done + 1].copy(), inputs[first:]
+        *facts, waiting = zip(*steps, strict=True)
+        starts, seconds, measured = map(np.array, facts)
         system = found.system
-        starts, seconds, measured = map(np.array, zip(*steps, strict=True))
         differ = 1 if self._spec.system.n_measured else 0
         if differ:
             y = found.of_states(measured, list(system.measured_states))
@@ -291,10 +304,15 @@ class Signs:
         turned, others = x[at][:, angles], np.delete(x[at], angles, axis=1)
         given = np.hstack([ones, others, np.cos(turned), np.sin(turned), last])
         lags = first + at - differ - np.arange(1, LAGS + 1)[:, None]
-        self._rows.append((errors[at], moved[at], given, np.moveaxis(inputs[lags], 0, -1)))
+        n = min(map(len, waiting))  # the delay may have changed
+        later = np.array([one[:n] for one in waiting])[at]
+        lagged = np.moveaxis(inputs[lags], 0, -1), np.moveaxis(later, 1, -1)
+        self._rows.append((errors[at], moved[at], given, *lagged))
         if sum(len(errors) for errors, *_ in self._rows) >= TESTED - 2 * differ:
-            yield
-            self._test(state, *map(np.concatenate, zip(*self._rows, strict=True)))
+            *rows, later = zip(*self._rows, strict=True)
+            n = min(part.shape[-1] for part in later)
+            rows.append(tuple(part[..., :n] for part in later))
+            yield from self._test(state, [*map(np.concatenate, rows)])
             self._rows = []
 
     def _flow(self, system: System, parameters: Array, x: Array, u: Array) -> Array:
@@ -305,21 +323,25 @@ class Signs:
             flow: Array = (following - x) / system.dt
             return flow[:, list(system.learned_rows)]
 
-    def _test(
-        self, state: Exploration, errors: Array, moved: Array, given: Array, earlier: Array
-    ) -> None:
-        """Count where inputs of earlier steps explain errors."""
+    def _test(self, state: Exploration, rows: Sequence[Array]) -> Iterator[None]:
+        """Count where inputs of earlier steps explain errors, or ones that are not to act yet."""
+        errors, moved, given, earlier, later = rows
         if not (np.isfinite(errors).all() and np.isfinite(given).all()):
             return
-        largest, lag = 0.0, 0
-        for j in range(earlier.shape[1]):
-            shares, sizes, most = explained(errors, given, earlier[:, j])
-            share = float(np.max(shares, where=sizes >= OF_MOTION * moved.std(axis=0), initial=0.0))
-            if share > largest:
-                largest, lag = share, most
+        largest, said = 0.0, ("", 0)
+        parts = [("late", 1, earlier)]
+        parts += [("early", k, later[..., k : k + LAGS]) for k in range(0, later.shape[-1], LAGS)]
+        for sign, first, inputs in parts:
+            for j in range(inputs.shape[1]):
+                yield
+                shares, sizes, most = explained(errors, given, inputs[:, j])
+                large = sizes >= OF_MOTION * moved.std(axis=0)
+                share = float(np.max(shares, where=large, initial=0.0))
+                if share > largest:
+                    largest, said = share, (sign, first + most)
         if largest >= EXPLAINED:
-            state.counts["late"] += 1
-            self._say("late", lag, 100.0 * largest)
+            state.counts[said[0]] += 1
+            self._say(*said, 100.0 * largest)
 
     def _measure_box(self, state: Exploration) -> None:
         """Count the sides of the box of which the states so far cover little."""
@@ -349,8 +371,8 @@ def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array
         Shares of the squares of the errors that all lags explain together.
     sizes : (r,)
         Root mean squares of that part, in the unit of the errors.
-    lag : int
-        Lag, from 1 on, that alone explains most of what they do.
+    place : int
+        Of the lag that alone explains most of what they do.
     """
     basis = np.linalg.qr(given)[0]
     rest = errors - basis @ (basis.T @ errors)
@@ -363,4 +385,4 @@ def explained(errors: Array, given: Array, earlier: Array) -> tuple[Array, Array
     basis = basis[:, sizes**2 > FOLLOWS * np.sum(sizes**2)]
     found = np.sum((basis.T @ rest) ** 2, axis=0)
     total = np.maximum(np.sum(rest**2, axis=0), np.finfo(float).tiny)
-    return found / total, np.sqrt(found / len(errors)), 1 + int(np.argmax(alone))
+    return found / total, np.sqrt(found / len(errors)), int(np.argmax(alone))

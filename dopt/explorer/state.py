@@ -115,6 +115,12 @@ class InFlight:
         self._departed.append(u)
         return self._flight.depart(u)
 
+    @property
+    def waiting(self) -> Array:
+        """Inputs that do not act yet, (n, m), the newest first."""
+        waiting = self._flight.inputs if self._flight else ()
+        return np.reshape(waiting, (-1, self._system.n_inputs))
+
     def hold(self, u: Array | None, seconds: float | None) -> None:
         """Hold an input, (m,), or the last one, for a time [s]; without a time, for long."""
         if self._flight is None:

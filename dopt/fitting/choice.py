@@ -56,7 +56,7 @@ from dopt.fitting.problem import (
 )
 from dopt.fitting.simulation import Data
 from dopt.log import Log, Piece
-from dopt.systems.plant import Plant, Unknown, first_guess
+from dopt.systems.plant import Plant, first_guess
 from dopt.types import Array, Integers
 
 ORDERS = ("information", "error", "random")
@@ -76,9 +76,7 @@ class State(NamedTuple):
     @property
     def constants(self) -> dict[str, tuple[float, float]]:
         """Value and expected standard error of each unknown constant, of delay and lag [s]."""
-        values, slopes = self.model.named_values(self.p)
-        errors = np.abs(slopes) * np.sqrt(np.diag(self.covariance)[self.model.named])
-        return dict(zip(values, zip(values.values(), errors.tolist(), strict=True), strict=True))
+        return self.model.with_errors(self.p, self.covariance)
 
 
 @dataclass(frozen=True)
@@ -173,7 +171,7 @@ def choose(
         window are one smooth curve.
     window : float, optional
         Longest window [s], whose initial state is unknown; .8 of the time scale by default.
-    hold : {"zero", "linear"}
+    hold : {"zero", "linear", "cubic"}
         As of :func:`dopt.fit`.
     seed : int
         Of the initial weights of the network, and of a random order.
@@ -290,13 +288,15 @@ def segments_of(plant: Plant, logs: Sequence[Log], seconds: float) -> tuple[list
     for number, log in enumerate(logs):
         step = log.step
         lead, tail = (margin + step for margin in _margins(plant, step))
-        for time, measured, inputs in log.pieces if seconds > 2 * step else ():
+        both = zip(log.pieces, log.left_out, strict=True) if seconds > 2 * step else ()
+        for (time, measured, inputs), lost in both:
             begin = time[0] + lead
             while begin + seconds + tail <= time[-1]:
                 ends = begin - lead - 0.5 * step, begin + seconds + tail + 0.5 * step
                 rows = slice(*np.searchsorted(time, ends))
                 piece = Piece(time[rows], measured[rows], inputs[rows])
                 out.append(Log.of_pieces(log.states, log.inputs, [piece]))
+                out[-1].left_out = (lost[rows],)
                 places.append(f"log {number}, {begin:.6g} to {begin + seconds:.6g} s")
                 begin += seconds
     if not out:
@@ -337,13 +337,7 @@ class _Search:
             rows = [fitted.chosen.solution.windows.rows, *(each + before for each in rows)]
             self.data = _joined(fitted.data, self.data)
         else:
-            delay, lag = self.plant.delay, self.plant.lag
-            self.physics = self.model = Model(
-                self.plant,
-                delay=first_guess(delay),
-                free_delay=isinstance(delay, Unknown),
-                free_lag=isinstance(lag, Unknown),
-            )
+            self.physics = self.model = Model(self.plant)
             self.constants, self.p, self.s = self.model.prior, self.model.prior, 1.0
         both = np.concatenate(rows)
         owners = np.arange(-1 if fitted else 0, self.n)

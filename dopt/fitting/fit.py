@@ -1,8 +1,8 @@
 """A plant fitted to logs: windows, delay, network and weight of the data chosen by validation.
 
 1. The unknown constants are fitted to short windows, with each delay from two samples too early to
-   three too late, and then to longer ones. The length of windows that predicts held-out blocks best
-   is kept.
+   three too late, or later while that fits better, and then to longer ones. The length of windows
+   that predicts held-out blocks best is kept.
 2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
 3. A level is looked for at which the inputs are cut before they act. Where it predicts the held-out
@@ -49,7 +49,7 @@ from dopt.fitting.problem import (
     windows_of,
 )
 from dopt.fitting.simulation import Data
-from dopt.log import Log
+from dopt.log import Log, count_text
 from dopt.systems.plant import Plant, Unknown, first_guess
 from dopt.types import Array, Integers
 
@@ -67,6 +67,9 @@ WEIGHTS = (30.0, 10.0, 3.0)
 
 SCANNED = (-2, -1, 0, 1, 2, 3)
 """Delays that are tried first, in samples from the guess."""
+
+LATEST = 3.0
+"""Latest unknown delay that is tried, in standard deviations from its guess."""
 
 MOST_VALIDATED = 200
 """Held-out windows of a block that are predicted."""
@@ -114,16 +117,17 @@ def fit(
     ----------
     plant : Plant
         With :func:`dopt.unknown` constants, delay or lag. Its ``learned`` rows get a network. An
-        unknown delay begins at the sample that fits best, and is free by a sample or so.
+        unknown delay begins at the sample that fits best, of those up to three standard deviations
+        late.
     logs : Log, DataFrame, mapping or sequence of them
         Recorded runs (:class:`dopt.Log`); a table is read with the names of the plant.
     validate : the same, optional
         Other runs, on which the report's errors are taken, in place of held-out blocks.
     width : int
         Units of the network that is tried; 0 for none.
-    hold : {"zero", "linear"}
+    hold : {"zero", "linear", "cubic"}
         Between two rows an input is as in the first one, as a controller holds it, or interpolated,
-        where it was measured.
+        where it was measured: by lines, or by a cubic spline where it is smooth, such as a road.
     window : float, optional
         Length of the windows [s], instead of one that is chosen.
     weights : sequence of float
@@ -153,8 +157,11 @@ def fit(
     plant = measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
-    work.notes += [note for run in runs for note in run.notes if " outlier" in note]
     work.outliers = sum((run.outliers for run in runs), work.outliers)
+    work.notes += [
+        f"{count_text(number, 'outlier')} of {name} left out"
+        for name, number in work.outliers.items()
+    ]
     lengths = work.lengths(window)
     work.scan_delay(lengths[0])
     work.choose_window(lengths)
@@ -175,6 +182,8 @@ def fit(
     physics = work.finish(work.model, work.solution, 1.0)
     chosen = work.finish(*network) if network else physics
     work.check_steps(chosen)
+    if hold == "linear" and physics.model.names:
+        work.check_hold(physics, data_of(plant, runs, "cubic"))
     held_out = work.held_out()
     return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
 
@@ -194,7 +203,7 @@ class _Selection:
         self.plant, self.data, self.blocks, self.say = plant, data, blocks, say
         self.workers, self._all_blocks = workers, blocks
         self.delay = first_guess(plant.delay)
-        self.model = self._model(self.delay, free=True)
+        self.model = Model(plant)
         self.step = float(np.median(_steps(data)))
         self.scale = time_scale(data)
         self.table: list[tuple[str, float, float]] = []
@@ -204,14 +213,6 @@ class _Selection:
         self.window = math.nan
         self._typical: float | None = None
         self._folds: dict[str, tuple[Model, list[Array]]] = {}
-
-    def _model(self, delay: float, *, free: bool) -> Model:
-        return Model(
-            self.plant,
-            delay=delay,
-            free_delay=free and isinstance(self.plant.delay, Unknown),
-            free_lag=isinstance(self.plant.lag, Unknown),
-        )
 
     def selection(self, seed: int) -> Selection:
         seconds = time.perf_counter() - self._began
@@ -276,19 +277,27 @@ class _Selection:
         total = int(np.diff(windows.rows, axis=1).sum())
         every = max(1, len(windows.rows) // MOST_SCANNED, total // ROWS_SCANNED)
         some = windows.where(np.arange(len(windows.rows)) % every == 0)
-        shifts = [shift for shift in SCANNED if self.delay + shift * self.step >= -2.5 * self.step]
+        guess, declared = self.delay, self.plant.delay
+        keeps_sign = isinstance(declared, Unknown) and declared.factor > 0
+        least = 0.0 if keeps_sign else -2.5 * self.step
+        latest = declared.at(LATEST) if isinstance(declared, Unknown) else guess
 
         def one(shift: int) -> tuple[float, Model, Solution]:
-            model = self._model(self.delay + shift * self.step, free=False)
+            model = Model(self.plant, delay=guess + shift * self.step)
             found = solve(Simulator(model, self.data), some, model.prior, 1.0, most=12)
             counts = some.counts(self.data)
             return float(np.sqrt(np.median(found.squares / counts))), model, found
 
-        fits = dict(zip(shifts, self._map(one, shifts), strict=True))
-        self.scan = {self.delay + shift * self.step: fits[shift][0] for shift in shifts}
-        best = min(shifts, key=lambda shift: fits[shift][0])
+        fits: dict[int, tuple[float, Model, Solution]] = {}
+        shifts = [shift for shift in SCANNED if guess + shift * self.step > least]
+        while shifts:
+            fits |= zip(shifts, self._map(one, shifts), strict=True)
+            best, last = min(fits, key=lambda shift: fits[shift][0]), max(fits)
+            later = range(last + 1, last + 1 + len(SCANNED) // 2) if best == last else ()
+            shifts = [shift for shift in later if guess + shift * self.step <= latest]
+        self.scan = {guess + shift * self.step: fit[0] for shift, fit in fits.items()}
         self.say(f"delay: {best:+d} samples from the guess fit best")
-        if isinstance(self.plant.delay, Unknown):
+        if isinstance(declared, Unknown):
             self.delay += best * self.step
             found = fits[best]
         else:
@@ -299,7 +308,6 @@ class _Selection:
                     f"{fits[0][0] / fits[best][0]:.1f} times as well: declare a delay of "
                     f"{self.delay + best * self.step:g} s, or a dopt.unknown one"
                 )
-        self.model = self._model(self.delay, free=True)
         self.data = self.data._replace(deviations=left_over(self.data, *found[1:]))
         p = self.model.extended(found[2].p, found[1])
         self.solution = found[2]._replace(p=p)
@@ -494,6 +502,23 @@ class _Selection:
                 f"steps of {2 * longest:g} s are too long for these equations: in half of them the "
                 f"simulations differ by {most:.2g} standard deviations of what is left; declare a "
                 f"smaller dt, or softer corners, such as tanh(rate / 0.5) for tanh(rate / 0.05)"
+            )
+
+    def check_hold(self, found: Estimate, curved: Data) -> None:
+        """Note it where constants are others with a curve through the inputs in place of lines."""
+        (model, solution, s, covariance), steps = found, []
+        weights = 1.0 / (1.0 + solution.squares / solution.scale) / s**2
+        for data in (self.data, curved._replace(deviations=self.data.deviations)):
+            linear = Simulator(model, data).linear(solution.p, solution.windows, weights)
+            slope = linear.slope - (solution.p - model.prior)
+            steps.append(np.linalg.solve(linear.normal + np.eye(model.q), slope))
+        moved = np.abs(np.subtract(*steps)) / np.sqrt(np.diag(covariance))
+        most = int(np.argmax(moved))
+        if moved[most] > 1.0:
+            self.notes.append(
+                f"a smooth curve through the inputs in place of lines moves {model.names[most]} by "
+                f"{moved[most]:.2g} standard errors, which contain none of it: take hold='cubic' "
+                f"if they are smooth, or record them more often"
             )
 
 

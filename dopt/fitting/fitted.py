@@ -22,6 +22,7 @@ from dopt.fitting.problem import (
     Solution,
     Windows,
     errors_ahead,
+    fast_noise,
     first_states,
     horizon_errors,
     left_over,
@@ -36,6 +37,9 @@ from dopt.types import Array, Integers
 
 USEFUL = 0.5
 """Largest error of a model that is worth using, by the changes themselves."""
+
+MOVING = 5.0
+"""Changes, by the noise, beside which a model can be judged."""
 
 CORRELATED = 0.7
 """Correlation of residuals with the row before from which the equations lack something."""
@@ -124,13 +128,7 @@ class Fitted:
 
     @functools.cached_property
     def constants(self) -> dict[str, tuple[float, float]]:
-        model, solution, _, covariance = self.physics
-        values, slopes = model.named_values(solution.p)
-        deviations = np.abs(slopes) * np.sqrt(np.diag(covariance)[model.named])
-        return {
-            name: (value, float(error))
-            for (name, value), error in zip(values.items(), deviations, strict=True)
-        }
+        return self.physics.model.with_errors(self.physics.solution.p, self.physics.covariance)
 
     def _delay_and_lag(self) -> str:
         """Return in a sentence whether the data tell the delay from the lag.
@@ -249,7 +247,7 @@ class Fitted:
     def errors_ahead(self, seconds: Array) -> Array:
         """Return the root mean square errors of held-out predictions so far ahead, (N, n).
 
-        Before the first horizon they are the noise, and beyond the last one they stay.
+        Before the first horizon they are the noise, and beyond the last one they may grow on.
         """
         return errors_ahead(self._held_out["model"], self.horizons, seconds, self._deviations)
 
@@ -349,7 +347,7 @@ class Fitted:
         """Return in a sentence how far ahead the model is worth using."""
         useful, longest = self._useful()
         if not longest:
-            return "Not judged: no run is long enough to be predicted."
+            return "Not judged: no run is long enough, or moves beyond its noise, to be predicted."
         if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
         if useful < longest:
@@ -362,7 +360,13 @@ class Fitted:
 
     def _useful(self) -> tuple[float, float]:
         """Return the longest time ahead that is worth using, and that was tried [s]."""
-        rows = [row for row in self.errors() if row["model"] == "model"]
+        noise = np.minimum(fast_noise(self.data), self._deviations)
+        least = dict(zip(self.noise, MOVING * noise, strict=True))
+        rows = [
+            row
+            for row in self.errors()
+            if row["model"] == "model" and row["nothing_changes"] > least[row["state"]]
+        ]
         horizons, useful = sorted({row["horizon"] for row in rows}), 0.0
         for horizon in horizons:
             here = [row for row in rows if row["horizon"] == horizon]

@@ -16,14 +16,15 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from dopt.errors import SpecificationError
 from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values, Work, work_for
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
-from dopt.systems.expressions import FUNCTIONS, compiled_text
-from dopt.systems.plant import Encoder, Plant, Unknown
+from dopt.systems.expressions import FUNCTIONS
+from dopt.systems.plant import Encoder, Plant, Unknown, first_guess
 from dopt.types import Array, Booleans, CompiledFunction, Equation, Integers, NumbaType
 
 _SYMBOLS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
@@ -163,10 +164,11 @@ class _Chain:
 
 _KINDS = {"identity": 0, "cos": 1, "sin": 2}
 
-HOLDS = ("zero", "linear")
+HOLDS = {"zero": 0, "linear": 1, "cubic": 3}
+"""Degrees of the curve through the rows of an input."""
 
-FINEST = 0.004
-"""Longest part of a sample over which a linearly interpolated input is taken as constant [s]."""
+PARTS = 4
+"""Parts of a sample over which an interpolated input is taken as constant."""
 
 MOST_STEPS = 300.0
 """Steps of a plant in one of a log, or of a log in one of a plant, beyond which a unit is wrong."""
@@ -178,20 +180,20 @@ class Known(NamedTuple):
     values: CompiledFunction  # (x, v, c, f)
     derivatives: CompiledFunction  # (x, v, c, f, G), with G of Work
     driven: Integers  # rows that constants or inputs change
-    equation: Equation
+
+
+Names = tuple[str, ...]
 
 
 @functools.lru_cache(maxsize=64)
-def compiled_known(key: PlantKey) -> Known:
+def compiled_known(
+    texts: Names, states: Names, inputs: Names, constants: Names, unknown: Names
+) -> Known:
     """Compile the known part of a plant, and its derivatives."""
-    plant = key.plant
-    groups = {"states": [*plant.states], "inputs": [*plant.inputs], "constants": [*plant.constants]}
-    texts = {f"known['{name}']": plant.known.get(name, "0.0") for name in plant.states}
-    equation = compiled_text(texts, groups, plant.guesses)
-    by = [*plant.states, *plant.inputs, *unknown_of(plant)]
-    values, _ = differentiated_text([*texts.values()], groups, [])
-    derivatives, where = differentiated_text([*texts.values()], groups, by)
-    driven = np.flatnonzero(where[:, len(plant.states) :].any(axis=1))
+    groups = {"states": states, "inputs": inputs, "constants": constants}
+    values, _ = differentiated_text(texts, groups, [])
+    derivatives, where = differentiated_text(texts, groups, [*states, *inputs, *unknown])
+    driven = np.flatnonzero(where[:, len(states) :].any(axis=1))
 
     def compiled(function: CompiledFunction, signature: NumbaType) -> CompiledFunction:
         if PLAIN:
@@ -201,27 +203,12 @@ def compiled_known(key: PlantKey) -> Known:
         code.disable_compile()
         return code
 
-    return Known(compiled(values, KNOWN), compiled(derivatives, DERIVATIVES), driven, equation)
+    return Known(compiled(values, KNOWN), compiled(derivatives, DERIVATIVES), driven)
 
 
 def unknown_of(plant: Plant) -> dict[str, Unknown]:
     """Return the unknown constants of a plant."""
     return {k: v for k, v in plant.constants.items() if isinstance(v, Unknown)}
-
-
-class PlantKey:
-    """A plant as the key of a cache: equal where its known part is."""
-
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
-        groups = (plant.states, plant.inputs, plant.constants, unknown_of(plant))
-        self._key = (*map(tuple, groups), tuple(plant.known.items()))
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, PlantKey) and self._key == other._key
 
 
 class Layout(NamedTuple):
@@ -236,7 +223,8 @@ class Model:
     """A plant as it is simulated.
 
     The parameters p are the unknown constants, the weights of the network, and where they are
-    unknown the delay and the lag, each in standard deviations of its prior.
+    unknown the delay and the lag, each in standard deviations of its prior. A ``delay`` that is
+    given is known.
 
     Attributes
     ----------
@@ -252,20 +240,21 @@ class Model:
         *,
         width: int = 0,
         layout: Layout | None = None,
-        delay: float = 0.0,
-        free_delay: bool = False,
-        free_lag: bool = False,
+        delay: float | None = None,
         seed: int = 0,
         longest_step: float | None = None,
     ) -> None:
-        self.plant, self.width, self.delay = plant, width, delay
-        self._made: dict[str, Any] = {"width": width, "layout": layout, "delay": delay}
-        self._made |= {"free_delay": free_delay, "free_lag": free_lag, "seed": seed}
-        self._made["longest_step"] = longest_step
+        self.plant, self.width = plant, width
+        self.delay = first_guess(plant.delay) if delay is None else delay
+        options: dict[str, Any] = {"delay": delay, "longest_step": longest_step, "seed": seed}
+        self._made = functools.partial(Model, plant, width=width, layout=layout, **options)
+        times = {"delay": plant.delay if delay is None else delay, "lag": plant.lag}
+        free = [name for name, value in times.items() if isinstance(value, Unknown)]
         system = plant.system(1)
         self.d, self.m = len(plant.states), len(plant.inputs)
-        known = compiled_known(PlantKey(plant))
-        self.equation, self.unknown = known.equation, unknown_of(plant)
+        self.equation, self.unknown = system.known, unknown_of(plant)
+        names = map(tuple, (plant.states, plant.inputs, plant.constants, self.unknown))
+        known = compiled_known(tuple(plant.known.get(n, "0.0") for n in plant.states), *names)
         places = [i for i, name in enumerate(plant.constants) if name in self.unknown]
         features = system.features
         p, r = len(features), len(system.learned_rows)
@@ -286,8 +275,8 @@ class Model:
             feature_scales=layout.scales,
             measured=np.array(measured, np.int64),
             width=width,
-            free_delay=free_delay,
-            free_lag=free_lag,
+            free_delay="delay" in free,
+            free_lag="lag" in free,
             longest_step=longest_step or plant.dt,
             limits=limits,
         )
@@ -299,11 +288,10 @@ class Model:
         inner = rng.standard_normal((width, p)).T.ravel(), rng.standard_normal(width)
         weights[: (p + 1) * width] = np.concatenate(inner)  # the output layer begins at zero
         self.n_named, self.n_weights = len(places), n_weights
-        times = np.zeros(int(free_delay) + int(free_lag))
-        self.prior = np.concatenate([np.zeros(len(places)), weights, times])
-        last = ["delay"] * free_delay + ["lag"] * free_lag
-        self.names = (*self.unknown, *last)
-        self.named = [*range(len(places)), *range(len(self.prior) - len(times), len(self.prior))]
+        self.prior = np.concatenate([np.zeros(len(places)), weights, np.zeros(len(free))])
+        self.names = (*self.unknown, *free)
+        self._times = {name: len(places) + n_weights + i for i, name in enumerate(free)}
+        self.named = [*range(len(places)), *self._times.values()]
 
     @property
     def q(self) -> int:
@@ -312,19 +300,19 @@ class Model:
 
     def with_network(self, width: int, layout: Layout, seed: int) -> Model:
         """Return the same model with a network beside the known part."""
-        changed = {"width": width, "layout": layout, "seed": seed}
-        return Model(self.plant, **self._made | changed)
+        return self._made(width=width, layout=layout, seed=seed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the model is made of, and not what is compiled for it."""
-        return functools.partial(Model, self.plant, **self._made), ()
+        return self._made, ()
 
     def extended(self, p: Array, other: Model) -> Array:
         """Return the parameters of another model without a network in the places of this one."""
         out = self.prior.copy()
-        places = dict(zip(self.names, self.named, strict=True))
-        for name, at in zip(other.names, other.named, strict=True):
-            out[places[name]] = p[at]
+        out[: self.n_named] = p[: self.n_named]
+        for name, at in self._times.items():
+            known = name not in other._times
+            out[at] = _deviations(self.plant.delay, other.delay) if known else p[other._times[name]]
         return out
 
     def values(self, p: Array) -> Values:
@@ -336,18 +324,14 @@ class Model:
         ):
             constants[at] = unknown.at(p[j])
             slopes[j] = unknown.slope(p[j])
-        at = self.n_named + self.n_weights
-        delay = self.delay
-        if self.structure.free_delay:
-            delay += self.plant.dt * p[at]
-            at += 1
-        given = self.plant.lag
-        z = float(p[at]) if self.structure.free_lag else 0.0
-        lag = given.at(z) if isinstance(given, Unknown) else given
-        lag_slope = given.slope(z) if isinstance(given, Unknown) else 0.0
+        numbers = [float(self.delay), float(first_guess(self.plant.lag)), 0.0, 0.0]
+        for i, name in enumerate(("delay", "lag")):
+            time = getattr(self.plant, name)
+            if name in self._times:
+                z = float(p[self._times[name]])
+                numbers[i], numbers[2 + i] = time.at(z), time.slope(z)
         weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
         sizes = np.ascontiguousarray(self.sizes)
-        numbers = (float(delay), float(lag), float(self.plant.dt), float(lag_slope))
         return Values(constants, slopes, weights, sizes, *numbers)
 
     def named_values(self, p: Array) -> tuple[dict[str, float], Array]:
@@ -357,14 +341,15 @@ class Model:
             name: float(values.constants[at])
             for name, at in zip(self.unknown, self.structure.unknown, strict=True)
         }
-        slopes = [*values.slopes]
-        if self.structure.free_delay:
-            found["delay"] = values.delay
-            slopes.append(values.delay_slope)
-        if self.structure.free_lag:
-            found["lag"] = values.lag
-            slopes.append(values.lag_slope)
-        return found, np.array(slopes)
+        found |= {name: float(getattr(values, name)) for name in self._times}
+        times = [getattr(values, f"{name}_slope") for name in self._times]
+        return found, np.array([*values.slopes, *times])
+
+    def with_errors(self, p: Array, covariance: Array) -> dict[str, tuple[float, float]]:
+        """Return value and standard error of each named parameter, by the covariance of p."""
+        values, slopes = self.named_values(p)
+        errors = np.abs(slopes) * np.sqrt(np.diag(covariance)[self.named])
+        return dict(zip(values, zip(values.values(), errors.tolist(), strict=True), strict=True))
 
     def derivative(self, p: Array, states: Array, inputs: Array) -> Array:
         """Return dx/dt, (N, d), at states, (N, d), under inputs that act, (N, m)."""
@@ -397,6 +382,13 @@ class Model:
         return work_for(self.d, self.m, columns, *sizes)
 
 
+def _deviations(unknown: Any, number: float) -> float:
+    """Return by how many standard deviations a number is above the guess."""
+    if unknown.factor:
+        return math.log(number / unknown.value, unknown.factor)
+    return float(number - unknown.value) / float(unknown.spread)
+
+
 def measured_names(plant: Plant) -> tuple[str, ...]:
     """Return the states that are measured, all where none is named."""
     return tuple(name for name in plant.states if name in plant.measured) or tuple(plant.states)
@@ -421,8 +413,8 @@ def rates_of(plant: Plant, measured: Sequence[int]) -> dict[int, tuple[int, floa
 def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | None = None) -> Data:
     """Return the pieces of logs one after the other.
 
-    With a linear hold each sample is divided into parts of constant input, so that the input is
-    interpolated between two rows; the rows in between have no measurement.
+    With a linear or cubic hold each sample is divided into parts, in each of which the input is the
+    mean of the line or curve through the rows; the rows in between have no measurement.
 
     Raises
     ------
@@ -432,7 +424,8 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
     if hold not in HOLDS:
         raise SpecificationError(
             f"hold is {hold!r}, but one of {', '.join(HOLDS)} is expected: choose 'zero' for "
-            f"inputs that are held between two rows, 'linear' for inputs that were measured."
+            f"inputs that are held between two rows, 'linear' for inputs that were measured, or "
+            f"'cubic' for smooth ones."
         )
     wanted = measured_names(plant)
     pieces: list[Piece] = []
@@ -458,7 +451,7 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
             )
         for piece in log.pieces:
             one = Piece(piece.time, piece.measured[:, columns], piece.inputs[:, given])
-            pieces.append(_interpolated(one) if hold == "linear" else one)
+            pieces.append(_interpolated(one, HOLDS[hold]) if HOLDS[hold] else one)
     pieces = [piece for piece in pieces if len(piece.time) > 1]
     if not pieces:
         raise SpecificationError(
@@ -488,13 +481,12 @@ def _first_deviations(plant: Plant, measured: Array) -> Array:
     return np.array(out)
 
 
-def _interpolated(piece: Piece) -> Piece:
+def _interpolated(piece: Piece, degree: int) -> Piece:
     t, y, u = piece
-    parts = max(2, math.ceil(float(np.median(np.diff(t))) / FINEST))
-    share = np.arange(parts) / parts
+    share = np.arange(PARTS) / PARTS
     time = np.concatenate([(t[:-1, None] + np.diff(t)[:, None] * share).ravel(), t[-1:]])
-    middle = (share + 0.5 / parts)[None, :, None]
-    between = u[:-1, None] + np.diff(u, axis=0)[:, None] * middle
+    whole = make_interp_spline(t, u, min(degree, len(t) - 1)).antiderivative()
+    means = np.diff(whole(time), axis=0) / np.diff(time)[:, None]
     measured = np.full((len(time), y.shape[1]), np.nan)
-    measured[::parts] = y
-    return Piece(time, measured, np.concatenate([between.reshape(-1, u.shape[1]), u[-1:]]))
+    measured[::PARTS] = y
+    return Piece(time, measured, np.concatenate([means, u[-1:]]))

@@ -578,7 +578,8 @@ def errors_ahead(
     """Return the root mean square errors of predictions so far ahead [s], (N, n).
 
     They are interpolated between the horizons; at 0 they are the noise, (n,), below which they do
-    not fall, and beyond the last horizon they stay.
+    not fall. Beyond the last horizon they grow by the power of the time, up to 1, by which they
+    grew from the first one on.
     """
     rows = horizon_errors(found, horizons)
     times = [0.0, *(row[0].horizon for row in rows)]
@@ -586,6 +587,19 @@ def errors_ahead(
     for c, deviation in enumerate(noise):
         errors = [deviation, *(max(row[c].rms, deviation) for row in rows)]
         out[:, c] = np.interp(seconds, times, errors)
+        if len(times) > 2 and 0.0 < errors[1] < errors[-1] < np.inf:
+            power = math.log(errors[-1] / errors[1]) / math.log(times[-1] / times[1])
+            out[:, c] *= np.maximum(seconds / times[-1], 1.0) ** min(power, 1.0)
+    return out
+
+
+def fast_noise(data: Data) -> Array:
+    """Return the standard deviation of what is fast in each measured state, (n,): noise at most."""
+    out = np.zeros(data.measured.shape[1])
+    for c, column in enumerate(data.measured.T):
+        seen = np.flatnonzero(np.isfinite(column))
+        bends = np.diff(column[seen], 2)[data.firsts[seen[2:]] == data.firsts[seen[:-2]]]
+        out[c] = 1.4826 * float(np.median(np.abs(bends))) / math.sqrt(6.0) if len(bends) else 0.0
     return out
 
 

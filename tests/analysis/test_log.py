@@ -73,6 +73,10 @@ def test_a_delay_is_found_in_open_loop(seed: int, delay: int) -> None:
         assert effect.has_effect
     effect = one_effect(motor(u, delay=delay, rate=True, step=0.01), u, "rate")
     assert effect.delays == (delay, delay)
+    u, ramps = held(rng, 2000), np.cumsum(held(rng, 2000)) / 100
+    seen = u + 0.01 * rng.normal(size=2000)
+    for given, logged in ((u, seen), (ramps, ramps)):
+        assert not one_effect(motor(given, delay=delay), logged).closed_loop
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -117,8 +121,13 @@ def test_an_arm_that_is_moved_by_hand_is_said_to_explain_nothing(seed: int) -> N
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_feedback_is_found_although_a_test_signal_is_added(seed: int) -> None:
-    signal = 0.3 * smooth(np.random.default_rng(seed), 3000)
+@pytest.mark.parametrize("jumps", [False, True])
+def test_feedback_is_found_although_a_signal_or_a_set_point_is_added(
+    seed: int, jumps: bool
+) -> None:
+    """The jumps of a set point were all that was left to tell, and called open loop."""
+    rng = np.random.default_rng(seed)
+    signal = np.repeat(rng.uniform(-3, 3, 10), 300) if jumps else 0.3 * smooth(rng, 3000)
     angle, speed, seen, u = 0.0, 0.0, [0.0], []
     for k in range(3000):
         seen.append(round(angle / 0.003) * 0.003)
@@ -454,6 +463,7 @@ def test_the_double_pendulum_has_encoders_and_no_pieces_at_jitter(name: str) -> 
     quanta = [one.quantum for one in health.states[:2]]
     np.testing.assert_allclose(quanta, 12.5 / 2**15, rtol=1e-3)
     assert "1 piece without gaps" in text
+    assert "closed loop" not in text  # under commands that were planned before
 
 
 @real

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+import dopt
 import dopt.explorer.explorer as module
 import dopt.explorer.signs as signs_module
 from analysis.serve.app import create_app
@@ -72,19 +73,42 @@ def test_an_undeclared_delay_is_said_in_samples(
     assert f"{delay} samples before" in text
     with Explorer(dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random") as one:
         drive(one, STEPS, delay)
-        assert one.counts["late"] == 0
+        assert one.counts["late"] == one.counts["early"] == 0
 
 
-def test_an_undeclared_delay_is_seen_in_angles_alone() -> None:
+@pytest.mark.parametrize("policy", ["random", "d_optimal"])
+@pytest.mark.parametrize(("declared", "delay"), [(1, 0), (4, 1), (4, 3), (13, 11), (20, 2)])
+def test_a_delay_that_is_declared_too_long_is_said(
+    caplog: pytest.LogCaptureFixture, declared: int, delay: int, policy: str
+) -> None:
+    with Explorer(dataclasses.replace(MOTOR, delay=declared * MOTOR.dt), policy=policy) as one:
+        drive(one, STEPS, delay)
+        assert (one.counts["early"], one.counts["late"]) == (2, 0)
+    [text] = [text for text in said(caplog) if "not to act yet" in text]
+    assert f"{delay} samples before" in text
+
+
+def test_a_delay_that_a_fit_shortens_is_tested_on() -> None:
+    """The inputs on their way are fewer from one step to the next."""
+    plant = dataclasses.replace(MOTOR, delay=dopt.unknown(4 * MOTOR.dt, spread=0.1))
+    with Explorer(plant, policy="random", learner="simulation_error", steps=STEPS) as one:
+        drive(one, STEPS, 1)
+        assert one.constants["delay"] < 2 * MOTOR.dt
+        assert one.counts["early"] == 0
+
+
+def test_a_wrong_delay_is_seen_in_angles_alone() -> None:
     """Estimates of the rates depend on earlier inputs, also where the delay is right."""
     learner = {"name": "joint_ekf", "refit_every": 100_000}
     plant = dataclasses.replace(MOTOR, measured={"angle": encoder(2048)})
-    for integrator, delay, late in (("euler", 0, 0), ("euler", 1, 1), ("rk4", 2, 0), ("rk4", 3, 3)):
+    ways = ("euler", 0, 0), ("euler", 1, 1), ("rk4", 2, 0), ("rk4", 3, 3), ("euler", 1, -2)
+    for integrator, delay, late in (*ways, ("rk4", 0, -1)):
         declared = (delay - late) * MOTOR.dt
         plant = dataclasses.replace(plant, integrator=integrator, delay=declared)
         with Explorer(plant, policy="random", learner=learner, steps=STEPS) as one:
             follow(one, Rig(delay, substeps=4), 2048)
-            assert one.counts["late"] == (2 if late else 0)
+            assert one.counts["late"] == (2 if late > 0 else 0)
+            assert one.counts["early"] == (2 if late < 0 else 0)
 
 
 @pytest.mark.parametrize("horizon", [STEPS, 2 * STEPS])

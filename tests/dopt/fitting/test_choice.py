@@ -193,6 +193,18 @@ def test_a_refit_finds_the_constants_in_the_segments_that_move() -> None:
     assert len(fitted.chosen.solution.windows.rows) == 4
 
 
+def test_outliers_of_the_segments_that_were_chosen_are_counted() -> None:
+    table = run(0, 600)
+    table.loc[range(40, 600, 60), "angle"] += 3.0
+    log = dopt.Log.for_plant(table, declared())
+    assert log.outliers == {"angle": 10}
+    found = dopt.choose(declared(), log, 5, seconds=1.0, width=0, refit=False)
+    counts = [one.outliers["angle"] for one in found.logs]
+    assert counts == [int(np.isnan(one.pieces[0].measured).sum()) for one in found.logs]
+    said = f"{sum(counts)} outliers of angle left out"
+    assert said in dopt.fit(declared(), found.logs, width=0, window=0.4).report()
+
+
 def test_a_fit_counts_as_known() -> None:
     plant = declared()
     found = dopt.fit(plant, run(0, 600), width=0)

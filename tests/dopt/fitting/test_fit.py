@@ -111,10 +111,9 @@ def test_a_simulation_agrees_with_scipy(delay: float, lag: float, jitter: float)
 def test_sensitivities_agree_with_differences(width: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     t, u = stamps(rng, 60, 0.3), rng.uniform(-2, 2, 60)
-    plant = pendulum(delay=dopt.unknown(0.0, spread=0.02), lag=dopt.unknown(0.03))
+    plant = pendulum(delay=dopt.unknown(0.0303, spread=0.02), lag=dopt.unknown(0.03))
     layout = Layout(np.array([0.0, 0.0, 0.5]), np.array([1.0, 1.0, 4.0]), np.array([9.0]))
-    how: dict[str, Any] = {"longest_step": 0.002, "delay": 0.0303, "width": width}
-    how |= {"free_delay": True, "free_lag": True, "layout": layout}
+    how: dict[str, Any] = {"longest_step": 0.002, "width": width, "layout": layout}
     sim = simulator(plant, t, np.zeros((60, 2)), u, **how)
     q, h = sim.model.q, 1e-5
     at = np.concatenate([sim.model.prior + 0.3 * rng.standard_normal(q), [0.4, 1.0]])
@@ -398,6 +397,62 @@ def test_the_report_says_whether_delay_and_lag_are_told_apart(
     assert delay + late == pytest.approx(0.02 + lag, abs=2e-3), "their sum is known in both cases"
 
 
+@pytest.mark.parametrize(
+    ("guess", "late"),
+    [
+        (dopt.unknown(0.0, spread=0.1), 0.18),  # beyond the first delays that are tried
+        (dopt.unknown(0.03, factor=3), 0.22),
+        (dopt.unknown(0.001), 0.02),  # earlier ones would be of the other sign
+    ],
+)
+def test_a_delay_is_found_as_far_as_it_was_declared_to_be(guess: Any, late: float) -> None:
+    table = run(0)
+    shifted = table.voltage.shift(-round((late - 0.02) / 0.02)).ffill()
+    found = dopt.fit(declared(delay=guess), table.assign(voltage=shifted), width=0)
+    value, error = found.constants["delay"]
+    assert abs(value - late) < 5 * error + 1e-4
+
+
+def test_a_delay_keeps_its_prior_as_other_constants_do() -> None:
+    """Its spread was that of one sample, whatever was declared."""
+    for declared_delay in (dopt.unknown(0.05, spread=1e-6), dopt.unknown(0.05, factor=1.00001)):
+        found = dopt.fit(declared(delay=declared_delay), run(0, 600), width=0, window=0.6)
+        assert found.constants["delay"][0] == pytest.approx(0.05, rel=0.01)
+
+
+@pytest.mark.parametrize("hold", ["linear", "cubic"])
+def test_what_a_smooth_input_does_between_rows_is_said(hold: str) -> None:
+    """A mass on a spring over a road; by lines the spring was 20 errors off without a word."""
+    rng, t = np.random.default_rng(0), np.arange(4000.0) * 0.01
+    frequencies, phases = rng.uniform(0.5, 6, 12), rng.uniform(0, 6, 12)
+
+    def road(s: float) -> Any:
+        return np.sin(2 * math.pi * frequencies * s + phases).sum() / 5
+
+    def rate(s: float, x: Array) -> list[float]:
+        return [x[1], 200 * (road(s) - x[0]) - 3 * x[1]]
+
+    x = solve_ivp(rate, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
+    plant = dopt.Plant(
+        states={"height": "m", "speed": "m/s"},
+        inputs={"road": "m"},
+        dt=0.01,
+        gamma=2.0,
+        known={"height": "speed", "speed": "spring * (road - height) - damping * speed"},
+        constants={"spring": dopt.unknown(150.0), "damping": dopt.unknown(2.0)},
+        learned=["speed"],
+        box={"speed": 10.0},
+        measured={"height": 1e-3},
+    )
+    table = {"t": t, "height": x + 1e-3 * rng.normal(size=4000), "road": [*map(road, t)]}
+    found = dopt.fit(plant, table, width=0, hold=hold, window=0.5)
+    errors = {"spring": 200.0, "damping": 3.0}
+    off = max(
+        abs(found.constants[name][0] - v) / found.constants[name][1] for name, v in errors.items()
+    )
+    assert (off > 5) == ("take hold='cubic'" in found.report()) == (hold == "linear")
+
+
 def test_units_of_a_state_do_not_matter() -> None:
     table, results = run(6, 600), []
     for unit in (1.0, 8.0, 1000.0):
@@ -414,7 +469,7 @@ def test_units_of_a_state_do_not_matter() -> None:
     ("arguments", "said"),
     [
         ({"width": -1}, "width is -1, but a whole number of at least 0"),
-        ({"hold": "cubic"}, "hold is 'cubic'"),
+        ({"hold": "quintic"}, "hold is 'quintic', but one of zero, linear, cubic"),
         ({"window": 1e9}, "window is"),
         ({"weights": (0.0,), "width": 4}, "weights is"),
         ({"workers": 0}, "workers is 0"),
@@ -442,6 +497,31 @@ def test_states_that_are_measured_at_different_times_are_judged() -> None:
     assert {row["windows"] for row in rows[2:]} == {15}
     assert found.verdict().startswith("Useful up to 1.2 s")
     assert min(found.coverage().values()) > 0.7
+
+
+def test_a_state_that_hardly_moves_within_the_noise_is_not_judged_there() -> None:
+    """A model without a fault was called no better than that nothing changes."""
+    table = run(3)
+    rng, drift = np.random.default_rng(0), 0.02 * np.cumsum(np.sin(table.angle)) * 0.02
+    table["level"] = drift + 0.01 * rng.normal(size=len(table))
+    plant = declared(
+        states={"angle": "rad", "rate": "rad/s", "level": "m"},
+        known={**declared().known, "level": "slow * sin(angle)"},
+        constants={**declared().constants, "slow": dopt.unknown(0.01)},
+        measured={"angle": dopt.encoder(4096), "level": 0.01},
+    )
+    assert dopt.fit(plant, table, width=0).verdict().startswith("Useful up to")
+
+
+def test_errors_grow_on_beyond_the_last_horizon() -> None:
+    """Bounds of an angle that nothing pulls back held a quarter of a long run."""
+    seconds, noise = np.array([0.0, 0.5, 4.0, 16.0, 64.0]), np.array([0.01, 0.5])
+    steps = np.arange(1, 41) * 0.1
+    error = np.column_stack([0.02 * np.sqrt(steps), 0.1 * np.ones(40)])
+    made = problem.Predicted([steps] * 3, [error] * 3, [np.ones((40, 2))] * 3, np.ones(2))
+    found = problem.errors_ahead([made], [1.0, 2.0, 4.0], seconds, noise)
+    np.testing.assert_allclose(found[2:, 0], 0.02 * np.sqrt(seconds[2:]))
+    np.testing.assert_array_equal(found[:, 1], 0.5)
 
 
 def test_short_runs_are_judged_as_far_as_they_go() -> None:
