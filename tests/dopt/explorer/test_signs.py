@@ -71,7 +71,9 @@ def test_an_undeclared_delay_is_said_in_samples(
         assert one.counts["late"] == 2  # at steps 500 and 800
     [text] = [text for text in said(caplog) if "earlier steps" in text]
     assert f"{delay} samples before" in text
-    with Explorer(dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random") as one:
+    with Explorer(
+        dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random", steps=STEPS
+    ) as one:
         drive(one, STEPS, delay)
         assert one.counts["late"] == one.counts["early"] == 0
 
@@ -81,7 +83,9 @@ def test_an_undeclared_delay_is_said_in_samples(
 def test_a_delay_that_is_declared_too_long_is_said(
     caplog: pytest.LogCaptureFixture, declared: int, delay: int, policy: str
 ) -> None:
-    with Explorer(dataclasses.replace(MOTOR, delay=declared * MOTOR.dt), policy=policy) as one:
+    with Explorer(
+        dataclasses.replace(MOTOR, delay=declared * MOTOR.dt), policy=policy, steps=STEPS
+    ) as one:
         drive(one, STEPS, delay)
         assert (one.counts["early"], one.counts["late"]) == (2, 0)
     [text] = [text for text in said(caplog) if "not to act yet" in text]
@@ -229,7 +233,7 @@ def test_states_in_a_small_part_of_the_box_are_said(caplog: pytest.LogCaptureFix
 
 def test_states_beyond_the_limits_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     limits = {"bounds": {"rate": [-0.5, 0.5]}, "enforced": False}
-    with explorer(limits=limits, policy="random") as one:
+    with explorer(limits=limits, policy="random", steps=STEPS) as one:
         drive(one, 100)
         beyond = np.count_nonzero(np.abs(one.states[1:, 1]) > 0.5)
         assert one.counts["beyond"] == beyond > 0
