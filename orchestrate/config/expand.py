@@ -24,7 +24,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import ConfigCompositionException
-from omegaconf import AnyNode, Container, DictConfig, ListConfig, OmegaConf, flag_override
+from omegaconf import Container, DictConfig, ListConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
 from dopt.errors import unknown_name
@@ -32,6 +32,7 @@ from dopt.registry import TARGET
 from orchestrate.config import TRIAL_SECTIONS, Combination
 from orchestrate.config.options import (
     KNOWN,
+    NOT_SWEPT,
     Axis,
     parsed_overrides,
     read_axes,
@@ -39,10 +40,9 @@ from orchestrate.config.options import (
     unknown_setting,
 )
 
-Settings = dict[str, Any]
 Check = Callable[[DictConfig], None]
 
-_REFERENCE = re.compile(r"\$\{\s*([A-Za-z_]\w*(?:\.\w+)*)\s*\}")
+_REFERENCE = re.compile(r"\$\{\s*\.*[A-Za-z_]\w*(?:\.\w+)*\s*\}")
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env:[^${}]*\}")
 
 
@@ -121,23 +121,35 @@ class _Expansion:
     lacking: dict[str, list[DictConfig]] = dataclasses.field(default_factory=dict)
 
     def combinations(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> Iterator[Combination]:
-        """Yield the combinations of one choice of all overrides except swept scalars."""
-        first, lacking = self._compose(axes, fixed)
-        self.check(first)
+        """Yield the combinations of one choice of all overrides except swept scalars.
+
+        Seeds stay together if nothing depends on them.
+        """
+        config, lacking = self._compose(axes, fixed)
+        self.check(config)
         unused = tuple(axis.key for axis in lacking)
         kept = [axis for axis in axes if axis not in lacking]
         used = tuple(axis.key for axis in kept if axis.replaces)
         self.used.update(used)
         for key in unused:
-            self.lacking.setdefault(key, []).append(first)
+            self.lacking.setdefault(key, []).append(config)
         scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
         overrides = tuple(fixed[axis.place] for axis in kept if axis.swept and axis.place in fixed)
-        overlay = _ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
-        if overlay.applicable:
-            found = _overlaid(overlay, scalars, overrides)
-        else:
-            found = self._one_by_one(kept, fixed, scalars)
-        yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
+        present = [key for key in self.sections if key in config.keys()]  # noqa: SIM118
+        together = [axis for axis in scalars if axis.key == "seed" and _is_alone(config, "seed")]
+        ranges = [range(1 if axis in together else len(axis.texts)) for axis in scalars]
+        for picks in itertools.product(*ranges):
+            chosen = list(zip(scalars, picks, strict=True))
+            for axis, pick in chosen:
+                OmegaConf.update(config, axis.key, axis.values[pick])
+            apart = (axis.argument(pick) for axis, pick in chosen if axis not in together)
+            yield Combination(
+                settings={key: _resolved(config, key) for key in present},
+                seeds=together[0].values if together else None,
+                overrides=(*overrides, *apart),
+                used=used,
+                unused=unused,
+            )
 
     def check_all_used(self) -> None:
         """Refuse a key that no choice has, with the nearest name in its place."""
@@ -171,18 +183,6 @@ class _Expansion:
         bare = self.composer.attempt(_in_order(others, fixed))
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
 
-    def _one_by_one(
-        self, axes: Sequence[Axis], fixed: Mapping[int, str], scalars: Sequence[Axis]
-    ) -> Iterator[Combination]:
-        """Compose each combination: a swept key holds a typed or structured value."""
-        for picks in itertools.product(*(range(len(axis.texts)) for axis in scalars)):
-            every = {**fixed, **_arguments(scalars, picks)}
-            composed = self.composer.compose(_in_order(axes, every))
-            overrides = tuple(every[axis.place] for axis in axes if axis.swept)
-            yield Combination(
-                _ScalarOverrides(composed, [], self.sections).settings([]), None, overrides
-            )
-
 
 def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[int, str]:
     return {axis.place: axis.argument(pick) for axis, pick in zip(axes, picks, strict=True)}
@@ -191,22 +191,6 @@ def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[int, str]:
 def _in_order(axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[str]:
     """Return an override for each axis: the one in ``fixed``, or the first value."""
     return [fixed.get(axis.place) or axis.argument(0) for axis in axes]
-
-
-def _overlaid(
-    overlay: _ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...]
-) -> Iterator[Combination]:
-    """Yield one combination per set of values; seeds stay together if nothing depends on them."""
-    together = [axis for axis in scalars if axis.key == "seed" and overlay.free("seed")]
-    ranges = [range(1 if axis in together else len(axis.texts)) for axis in scalars]
-    for picks in itertools.product(*ranges):
-        chosen = list(zip(scalars, picks, strict=True))
-        yield Combination(
-            settings=overlay.settings([axis.values[pick] for axis, pick in chosen]),
-            seeds=together[0].values if together else None,
-            overrides=overrides
-            + tuple(axis.argument(pick) for axis, pick in chosen if axis not in together),
-        )
 
 
 class _Composer:
@@ -315,69 +299,14 @@ def _apply(override: Override, config: DictConfig) -> None:
     OmegaConf.update(config, override.key_or_group, override.value(), merge=True, force_add=forced)
 
 
-class _ScalarOverrides:
-    """Composed configuration in which the scalars at ``keys`` change.
-
-    Plain references such as ``model.width: ${width}`` are tracked by name; OmegaConf resolves any
-    other interpolation again each time.
-
-    Parameters
-    ----------
-    config
-        Configuration that was composed with some value for each of the keys.
-    keys
-        Dotted keys of the scalars.
-    sections
-        Top-level keys that the settings hold.
-    """
-
-    def __init__(self, config: DictConfig, keys: Sequence[str], sections: Sequence[str]) -> None:
-        self._config = config
-        self._keys = list(keys)
-        present = [key for key in sections if key in config.keys()]  # noqa: SIM118
-        self._base = {key: _resolved(config, key) for key in present}
-        references = list(_interpolations(config, present))
-        self._paths = {key: [key] for key in keys}
-        self._computed = [path for path, raw in references if not self._follow(path, raw)]
-
-    @property
-    def applicable(self) -> bool:
-        """Whether every key holds an untyped scalar, so that it accepts any value."""
-        return all(type(_node(self._config, key)) is AnyNode for key in self._keys)
-
-    def free(self, key: str) -> bool:
-        """Return whether no other key depends on ``key``."""
-        return not self._computed and self._paths.get(key) == [key]
-
-    def settings(self, values: Sequence[object]) -> Settings:
-        """Return the resolved sections with one value for each key."""
-        changes = dict(zip(self._keys, values, strict=True))
-        result = dict(self._base)
-        fresh: set[str] = set()
-        for key, value in changes.items():
-            for path in self._paths[key]:
-                _put(result, path, value, fresh)
-        if self._computed:
-            for key, value in changes.items():
-                OmegaConf.update(self._config, key, value)
-            for path in self._computed:
-                _put(result, path, _resolved(self._config, path), fresh)
-        return result
-
-    def _follow(self, path: str, raw: str) -> bool:
-        """Return whether ``path`` is constant, or equal to one of the keys."""
-        if _ENVIRONMENT.fullmatch(raw):
-            return True
-        match = _REFERENCE.fullmatch(raw)
-        if match is None:
-            return False
-        if match[1] in self._paths:
-            self._paths[match[1]].append(path)
-            return True
-        target = _node(self._config, match[1])
-        if target is None or isinstance(target, Container):
-            return False
-        return not target._is_interpolation() or self._follow(path, str(target._value()))
+def _is_alone(config: DictConfig, key: str) -> bool:
+    """Return whether no setting of a trial refers to a top-level key, as far as texts tell."""
+    names = [name for name in map(str, config) if name not in NOT_SWEPT]
+    plain = (_REFERENCE, _ENVIRONMENT)
+    return all(
+        key not in text and any(form.fullmatch(text) for form in plain)
+        for _, text in _interpolations(config, names)
+    )
 
 
 def _interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -395,12 +324,6 @@ def _interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterato
             yield from _interpolations(child, inner, f"{path}.")
 
 
-def _node(config: DictConfig, key: str) -> Any:
-    parent, _, last = key.rpartition(".")
-    holder = OmegaConf.select(config, parent) if parent else config
-    return holder._get_node(last) if isinstance(holder, DictConfig) else None
-
-
 def has_key(config: DictConfig, key: str) -> bool:
     """Return whether a dotted key, or an entry of a list, exists, whatever its value."""
     parent, _, last = key.rpartition(".")
@@ -408,7 +331,7 @@ def has_key(config: DictConfig, key: str) -> bool:
         holder = OmegaConf.select(config, parent) if parent else config
         if isinstance(holder, ListConfig):
             return last.isdecimal() and int(last) < len(holder)
-        return _node(config, key) is not None
+        return isinstance(holder, DictConfig) and holder._get_node(last) is not None
     return False
 
 
@@ -417,26 +340,6 @@ def _resolved(config: DictConfig, path: str) -> Any:
     if isinstance(value, Container):
         return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
     return value
-
-
-def _put(result: Settings, path: str, value: object, fresh: set[str]) -> None:
-    """Set a path in nested dicts; dicts not in ``fresh`` are shared, and are copied first."""
-    *parents, last = path.split(".")
-    if (parents or [last])[0] not in result:
-        return
-    holder: Any = result
-    for depth, key in enumerate(parents):
-        index = _index(holder, key)
-        trail = ".".join(parents[: depth + 1])
-        if trail not in fresh:
-            holder[index] = holder[index].copy()
-            fresh.add(trail)
-        holder = holder[index]
-    holder[_index(holder, last)] = value
-
-
-def _index(holder: object, key: str) -> Any:
-    return int(key) if isinstance(holder, list) else key
 
 
 def _keys_below(config: DictConfig, holder: str) -> Iterable[str]:
