@@ -45,7 +45,7 @@ from hydra.errors import (
     MissingConfigException,
     OverrideParseException,
 )
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from dopt.errors import DoptError, SpecificationError, suggestion, unknown_name
@@ -466,37 +466,6 @@ def _unknown_key(cause: OmegaConfBaseException) -> str:
     if isinstance(parent, DictConfig) and TARGET in names:
         return str(unknown_field(key, str(parent[TARGET]), names))
     return str(unknown_setting(key, names))
-
-
-def check_launch(launch: Mapping[str, object]) -> None:
-    """Refuse an unknown setting of the launch, its store or its executor.
-
-    Parameters
-    ----------
-    launch
-        The sections ``launch``, ``store`` and ``executor`` in plain types.
-    """
-    executor = launch["executor"]
-    name = executor.get("name") if isinstance(executor, Mapping) else None
-    _check("launch", launch["launch"], content_of(CONFIGURATION / "config.yaml").get("launch"))
-    _check("store", launch["store"], {"url": None})
-    _check("executor", executor, content_of(CONFIGURATION / "executor" / f"{name}.yaml"))
-
-
-def _check(path: str, given: object, known: object) -> None:
-    if not isinstance(given, Mapping) or not isinstance(known, Mapping) or not known:
-        return
-    for key, value in given.items():
-        if key not in known:
-            raise unknown_name(f"setting of {path}", key, map(str, known))
-        _check(f"{path}.{key}", value, known[key])
-
-
-@functools.cache
-def content_of(path: Path) -> Mapping[str, Any]:
-    """Return the content of a file; empty for an option outside this folder."""
-    content = OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else {}
-    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
 
 
 def unknown_setting(key: str, names: Iterable[str]) -> SpecificationError:

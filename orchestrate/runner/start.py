@@ -373,11 +373,9 @@ def worked(tally: Tally, scheduler: Scheduler, left: int, seconds: float) -> str
 def checked(request: Request) -> tuple[Grid, LaunchSettings]:
     """Return the checked grid and settings of a launch, or raise ``DoptError``."""
     from dopt.kernel import cache
-    from orchestrate.config.options import check_launch
 
     grid = build_grid(request.combinations, single=request.single)
     settings = LaunchSettings.from_mapping(request.launch)
-    check_launch(request.launch)
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)
