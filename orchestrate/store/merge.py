@@ -12,8 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, groupby
-from operator import itemgetter
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -62,18 +61,6 @@ _ATTEMPTS = (
     "WHERE a.trial_id BETWEEN :first AND :last AND a.outcome IS NOT NULL "
     "ORDER BY a.trial_id, a.attempt"
 )
-_FINISHED = (
-    "trial_id IN (SELECT trial_id FROM trial WHERE trial_id BETWEEN :first AND :last "
-    "AND status IN ('done', 'diverged'))"
-)
-_STEPS = (
-    f"SELECT trial_id, t, {', '.join(STEP_VALUES)} FROM step WHERE {_FINISHED} ORDER BY trial_id, t"
-)
-_TRAJECTORIES = f"SELECT * FROM trajectory WHERE {_FINISHED}"
-_ASSESSMENTS = (
-    f"SELECT trial_id, t, measure, value FROM assessment WHERE {_FINISHED} "
-    "ORDER BY trial_id, t, measure"
-)
 # All trials of a configuration have the same number of assessments, except explorations, beside
 # the sample loss, which may have been stored of some alone.
 _EXPECTED = (
@@ -101,6 +88,34 @@ class Curve:
     steps: Array
     trajectory: dict[str, Any]
     assessments: list[tuple[int, str, float | None]]
+
+
+def curves(connection: Connection, trial_ids: Sequence[int]) -> dict[int, Curve]:
+    """Return what is stored of trials; those that lack a trajectory, or a step, are left out."""
+    steps, arrays, assessments = (
+        _by_trial(connection.execute(select(table).where(table.c.trial_id.in_(trial_ids))))
+        for table in (step_table, trajectory_table, assessment)
+    )
+    found = {}
+    for trial_id, (row,) in arrays.items():
+        numbers = np.array(sorted(steps.get(trial_id, [])), np.float64)
+        numbers = numbers.reshape(-1, 1 + len(STEP_VALUES))
+        if np.array_equal(numbers[:, 0], np.arange(len(numbers))):
+            packed = dict(zip(_ARRAYS, row, strict=True))
+            rows = sorted(assessments.get(trial_id, []))
+            found[trial_id] = Curve(numbers[:, 1:], packed, rows)
+    return found
+
+
+_ARRAYS = [one.name for one in trajectory_table.columns][1:]
+
+
+def _by_trial(rows: Iterable[Row[Any]]) -> dict[int, list[tuple[Any, ...]]]:
+    """Return rows by their trial_id, the first column, without it."""
+    found = defaultdict(list)
+    for trial_id, *values in rows:
+        found[trial_id].append(tuple(values))
+    return found
 
 
 @dataclass(frozen=True)
@@ -152,39 +167,22 @@ class Source:
         attempts = defaultdict(list)
         for row in self._dicts(_ATTEMPTS, **ends):
             attempts[row["trial_id"]].append(row)
-        steps = _by_trial(self._moment.rows(_STEPS, **ends))
-        assessments = _by_trial(self._moment.rows(_ASSESSMENTS, **ends))
-        trajectories = {row.pop("trial_id"): row for row in self._dicts(_TRAJECTORIES, **ends)}
+        finished = [row["trial_id"] for row in rows if row["status"] in FINISHED]
+        with self._moment._snapshot() as connection:
+            stored = curves(connection, finished)
         found = []
         for row in rows:
-            place = row["trial_id"]
-            rest = steps.get(place, []), trajectories.get(place), assessments.get(place, [])
-            curve = self._curve(row, *rest)
+            curve = stored.get(row["trial_id"])
+            if curve is not None and not self._is_whole(row, curve):
+                curve = None
             wrong = not (self._has_its_key(row) and _agree(row, curve))
-            found.append(Candidate(row, attempts[place], curve, wrong))
+            found.append(Candidate(row, attempts[row["trial_id"]], curve, wrong))
         return found
 
-    def _curve(
-        self,
-        row: Mapping[str, Any],
-        steps: Sequence[tuple[Any, ...]],
-        trajectory: Mapping[str, Any] | None,
-        assessments: list[tuple[Any, ...]],
-    ) -> Curve | None:
-        values = np.array(steps, np.float64).reshape(-1, 1 + len(STEP_VALUES))
+    def _is_whole(self, row: Mapping[str, Any], curve: Curve) -> bool:
         expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
-        if (
-            trajectory is None
-            or len(values) != row["n_rows"]
-            or not np.array_equal(values[:, 0], np.arange(len(values)))
-            or expected not in (None, len(_of_all(assessments)))
-        ):
-            return None
-        packed = {
-            name: bytes(one) if isinstance(one, memoryview) else one
-            for name, one in trajectory.items()
-        }
-        return Curve(values[:, 1:], packed, assessments)
+        n_assessments = len(_of_all(curve.assessments))
+        return len(curve.steps) == row["n_rows"] and expected in (None, n_assessments)
 
     def _has_its_key(self, row: Mapping[str, Any]) -> bool:
         """Return whether keys are hashes of what is stored: no specification is built of it."""
@@ -227,12 +225,6 @@ def _agree(row: Mapping[str, Any], curve: Curve | None) -> bool:
     return bool(same and fits and sizes == (2, 2, 1, steps + 1, DTYPE))
 
 
-def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]]]:
-    """Return the rows without their trial_id, the first column, by which they are sorted."""
-    groups = groupby(rows, key=itemgetter(0))
-    return {trial_id: [row[1:] for row in group] for trial_id, group in groups}
-
-
 def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
     """Return the assessments, (t, measure, value), that all trials of a configuration have."""
     return [tuple(one) for one in assessments if one[1] != SAMPLE_LOSS]
@@ -240,12 +232,8 @@ def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
 
 _COPIED = ("status", *OUTCOME_COLUMNS)
 _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
-_ASSESSMENTS_HERE = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
-    assessment.c.t, assessment.c.measure
-)
 _INSERT_TRIALS = insert(trial).returning(trial.c.trial_key, trial.c.trial_id)
 _UPDATE_TRIAL = update(trial).where(trial.c.trial_id == bindparam("here"))
-_STEPS_HERE = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
 
 
 class Target:
@@ -314,32 +302,9 @@ class Target:
             if rows:
                 self._connection.execute(insert(table), rows)
 
-    def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
-        """Return whether both databases hold equal numbers; times may differ."""
-        if any(getattr(here, name) != row[name] for name in ("status", "n_steps", "diverged_at")):
-            return False
-        where = here.trial_id
-        steps = self._connection.execute(_STEPS_HERE.where(step_table.c.trial_id == where)).all()
-        mine = np.array([tuple(one) for one in steps], dtype=np.float64)
-        arrays = self._connection.execute(
-            select(trajectory_table).where(trajectory_table.c.trial_id == where)
-        ).one_or_none()
-        rows = self._connection.execute(_ASSESSMENTS_HERE.where(assessment.c.trial_id == where))
-        return (
-            sorted(_of_all(rows)) == sorted(_of_all(there.assessments))
-            and mine.shape == there.steps.shape
-            and np.array_equal(mine[:, _NUMBERS], there.steps[:, _NUMBERS], equal_nan=True)
-            and arrays is not None
-            and all(getattr(arrays, name) == value for name, value in there.trajectory.items())
-        )
-
-    def steps_ahead(self, here: Row[Any], there: Curve) -> int | None:
-        """Return by how many steps an exploration is longer here; None if it is another one."""
-        statement = select(trajectory_table).where(trajectory_table.c.trial_id == here.trial_id)
-        mine = self._connection.execute(statement).mappings().one_or_none()
-        if mine is None:
-            return None
-        return steps_ahead(unpacked(dict(mine)), unpacked(there.trajectory))
+    def curve(self, here: Row[Any]) -> Curve | None:
+        """Return what is stored of a finished trial; None if some is missing."""
+        return curves(self._connection, [here.trial_id]).get(here.trial_id)
 
     def clear(self, here: Row[Any]) -> None:
         """Delete the rows of an exploration that has more steps in the source."""
@@ -402,6 +367,17 @@ class Target:
             del values["error_id"]
             return insert_error(self._connection, values)
         return int(here)
+
+
+def _is_same(here: Row[Any], mine: Curve, row: Mapping[str, Any], there: Curve) -> bool:
+    """Return whether both databases hold equal numbers of a trial; times may differ."""
+    pairs = mine.steps[:, _NUMBERS], there.steps[:, _NUMBERS]
+    return (
+        all(getattr(here, name) == row[name] for name in ("status", "n_steps", "diverged_at"))
+        and _of_all(mine.assessments) == _of_all(there.assessments)
+        and np.array_equal(*pairs, equal_nan=True)
+        and mine.trajectory == there.trajectory
+    )
 
 
 def _last_attempt(one: Candidate, here: Row[Any] | None) -> int:
@@ -533,9 +509,11 @@ def _merge_trial(target: Target, one: Candidate, here: Row[Any] | None) -> str:
     if finished and curve is None:
         return "incomplete"
     if curve is not None and here is not None and here.status in FINISHED:
-        if target.is_same(here, row, curve):
+        mine, ahead = target.curve(here), None
+        if mine is not None and _is_same(here, mine, row, curve):
             return "identical"
-        ahead = target.steps_ahead(here, curve) if row["grows"] else None
+        if mine is not None and row["grows"]:
+            ahead = steps_ahead(unpacked(mine.trajectory), unpacked(curve.trajectory))
         if ahead is None or ahead == 0:
             return "conflicts"
         if ahead > 0:
