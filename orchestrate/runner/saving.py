@@ -307,9 +307,6 @@ LIBRARIES = (
     "torch",
 )
 
-LARGEST_FILE_BYTES = 16 * 2**20
-"""Largest untracked file that is hashed; of a larger one the size is taken."""
-
 SOURCES = ("*.py", "*.yaml", "*.yml", "*.toml", ":(exclude)build", ":(exclude)dist")
 """Git path patterns of untracked files that can change a result: code and configuration."""
 
@@ -356,13 +353,8 @@ def _difference(root: Path) -> bytes:
 
 
 def _content(root: Path, name: bytes) -> bytes:
-    """Return the hash of a file, or its size if it is too large."""
-    path = root / os.fsdecode(name)
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE_BYTES:
-            return str(size).encode()
-        return hashlib.sha256(path.read_bytes()).digest()
+        return hashlib.sha256((root / os.fsdecode(name)).read_bytes()).digest()
     except OSError:
         return b"unreadable"
 
