@@ -95,11 +95,13 @@ def expand(
     """
     expansion = _Expansion(_Composer(settings), sections, check)
     result: list[Combination] = []
-    for arguments in grids:
-        axes = read_axes(expansion.composer.loader, arguments)
+    for words in grids:
+        axes = read_axes(expansion.composer.loader, words)
         fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
         for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
-            result.extend(expansion.combinations(axes, _arguments(fixed, picks)))
+            chosen = zip(fixed, picks, strict=True)
+            arguments = {axis.place: axis.argument(pick) for axis, pick in chosen}
+            result.extend(expansion.combinations(axes, arguments))
     expansion.check_all_used()
     return result
 
@@ -174,7 +176,8 @@ class _Expansion:
         lacking = [] if composed is not None else self._lacking(axes, fixed)
         if lacking:
             kept = [axis for axis in axes if axis not in lacking]
-            composed = self.composer.compose(_in_order(kept, fixed))
+            overrides = _in_order(kept, fixed)
+            composed = self.composer.attempt(overrides)
         return composed or self.composer.by_hydra(overrides), lacking
 
     def _lacking(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[Axis]:
@@ -182,10 +185,6 @@ class _Expansion:
         others = [axis for axis in axes if axis not in replacing]
         bare = self.composer.attempt(_in_order(others, fixed))
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
-
-
-def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[int, str]:
-    return {axis.place: axis.argument(pick) for axis, pick in zip(axes, picks, strict=True)}
 
 
 def _in_order(axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[str]:
@@ -211,10 +210,6 @@ class _Composer:
         self._options: dict[str, DictConfig | None] = {}
         self._frames: dict[tuple[str, ...], bytes] = {}
         self._latest: tuple[tuple[str, ...], bytes] = ((), b"")
-
-    def compose(self, overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration for overrides without sweeps."""
-        return self.attempt(overrides) or self.by_hydra(overrides)
 
     def by_hydra(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration that Hydra composes, or raise its error."""
