@@ -34,7 +34,6 @@ from orchestrate.store.schema import (
     assessment,
     attempt,
     config,
-    error,
     launch,
     trial,
 )
@@ -49,17 +48,15 @@ PAGE_STEPS = 5_000
 """Steps in one transaction, unless its only trial has more, which bounds the memory."""
 
 _TRIALS = (
-    f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, e.hash AS error_hash, "
+    f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, "
     f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' THEN 1 ELSE 0 END AS grows FROM trial r "
-    "JOIN config c ON c.config_id = r.config_id LEFT JOIN error e ON e.error_id = r.error_id "
+    "JOIN config c ON c.config_id = r.config_id "
     "WHERE r.trial_id > :last AND r.status IN ('done', 'diverged', 'failed', 'cancelled') "
     "ORDER BY r.trial_id LIMIT :size"
 )
 _ATTEMPTS = (
-    "SELECT a.*, e.hash AS error_hash FROM attempt a "
-    "LEFT JOIN error e ON e.error_id = a.error_id "
-    "WHERE a.trial_id BETWEEN :first AND :last AND a.outcome IS NOT NULL "
-    "ORDER BY a.trial_id, a.attempt"
+    "SELECT * FROM attempt WHERE trial_id BETWEEN :first AND :last AND outcome IS NOT NULL "
+    "ORDER BY trial_id, attempt"
 )
 # All trials of a configuration have the same number of assessments, except explorations, beside
 # the sample loss, which may have been stored of some alone.
@@ -113,8 +110,8 @@ _ARRAYS = [one.name for one in trajectory_table.columns][1:]
 def _by_trial(rows: Iterable[Row[Any]]) -> dict[int, list[tuple[Any, ...]]]:
     """Return rows by their trial_id, the first column, without it."""
     found = defaultdict(list)
-    for trial_id, *values in rows:
-        found[trial_id].append(tuple(values))
+    for row in rows:
+        found[row[0]].append(tuple(row[1:]))
     return found
 
 
@@ -125,7 +122,7 @@ class Candidate:
     Attributes
     ----------
     row
-        Its row, with the name of its configuration and the hash of its error.
+        Its row, with the name of its configuration.
     attempts
         Finished attempts at it, the oldest first.
     curve
@@ -199,8 +196,8 @@ class Source:
         (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
         return row
 
-    def error(self, digest: str) -> dict[str, Any]:
-        (row,) = self._dicts("SELECT * FROM error WHERE hash = :hash", hash=digest)
+    def error(self, error_id: int) -> dict[str, Any]:
+        (row,) = self._dicts("SELECT * FROM error WHERE error_id = :id", id=error_id)
         return row
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
@@ -251,6 +248,7 @@ class Target:
         self._source = source
         self._launches = launches
         self._configs: dict[str, int] = {}  # config_id here by key, filled on the way
+        self._errors: dict[int, int] = {}  # error_id here by the one there
         self._added: list[tuple[Candidate, Row[Any] | None]] = []
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
@@ -319,7 +317,7 @@ class Target:
             values = {name: row[name] for name in _COPIED} | {"attempt": _last_attempt(one, here)}
             for name in ("launch_id", "registered_by"):
                 values[name] = self._launches.get(row[name])
-            values["error_id"] = self._error(row["error_hash"])
+            values["error_id"] = self._error(row["error_id"])
             if here is None:
                 values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
                 new.append(
@@ -342,7 +340,7 @@ class Target:
                 "trial_id": trial_id,
                 "attempt": number,
                 "launch_id": self._launches[row["launch_id"]],
-                "error_id": self._error(row["error_hash"]),
+                "error_id": self._error(row["error_id"]),
             }
 
     def _config(self, config_key: str, there: int) -> int:
@@ -357,16 +355,10 @@ class Target:
             self._configs[config_key] = int(here)
         return self._configs[config_key]
 
-    def _error(self, digest: str | None) -> int | None:
-        if digest is None:
-            return None
-        statement = select(error.c.error_id).where(error.c.hash == digest)
-        here = self._connection.execute(statement).scalar()
-        if here is None:
-            values = self._source.error(digest)
-            del values["error_id"]
-            return insert_error(self._connection, values)
-        return int(here)
+    def _error(self, there: int | None) -> int | None:
+        if there is not None and there not in self._errors:
+            self._errors[there] = insert_error(self._connection, self._source.error(there))
+        return None if there is None else self._errors[there]
 
 
 def _is_same(here: Row[Any], mine: Curve, row: Mapping[str, Any], there: Curve) -> bool:
