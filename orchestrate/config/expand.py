@@ -1,7 +1,7 @@
 """Expansion of overrides to the combinations of a grid.
 
-:func:`hydra.compose` composes the configuration of each choice of groups; scalar sweeps are a
-product over its plain values. The result equals what Hydra's basic sweeper gives wherever that one
+:func:`hydra.compose` composes the configuration of each choice of groups, in which the other values
+are set. The result equals what Hydra's basic sweeper gives wherever that one
 succeeds, except for the values of some sweeps (:mod:`orchestrate.config.options`).
 
 The basic sweeper fails if an override sets a key that only some of the choices have, such as
@@ -16,7 +16,7 @@ import dataclasses
 import itertools
 import pickle
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import hydra
@@ -41,6 +41,8 @@ from orchestrate.config.options import (
 )
 
 Check = Callable[[DictConfig], None]
+Pick = tuple[Axis, int]
+"""Override, and which of its values."""
 
 _REFERENCE = re.compile(r"\$\{\s*\.*[A-Za-z_]\w*(?:\.\w+)*\s*\}")
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env:[^${}]*\}")
@@ -97,11 +99,9 @@ def expand(
     result: list[Combination] = []
     for words in grids:
         axes = read_axes(expansion.composer.loader, words)
-        fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
-        for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
-            chosen = zip(fixed, picks, strict=True)
-            arguments = {axis.place: axis.argument(pick) for axis, pick in chosen}
-            result.extend(expansion.combinations(axes, arguments))
+        counts = [1 if axis.key == "seed" else len(axis.texts) for axis in axes]
+        for picks in itertools.product(*map(range, counts)):
+            result.extend(expansion.combinations([*zip(axes, picks, strict=True)]))
     expansion.check_all_used()
     return result
 
@@ -113,51 +113,47 @@ class _Expansion:
     Attributes
     ----------
     used, lacking
-        Keys that some choice uses, and choices, composed without it, that lack a key that is set.
+        Keys that some choice uses, and the choices that lack a key that is set, each with its
+        configuration.
     """
 
     composer: _Composer
     sections: Sequence[str]
     check: Check
     used: set[str] = dataclasses.field(default_factory=set)
-    lacking: dict[str, list[DictConfig]] = dataclasses.field(default_factory=dict)
+    lacking: dict[str, dict[str, DictConfig]] = dataclasses.field(default_factory=dict)
 
-    def combinations(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> Iterator[Combination]:
-        """Yield the combinations of one choice of all overrides except swept scalars.
-
-        Seeds stay together if nothing depends on them.
-        """
-        config, lacking = self._compose(axes, fixed)
+    def combinations(self, picks: Sequence[Pick]) -> Iterator[Combination]:
+        """Yield one combination, with all seeds, or one for each seed if something follows it."""
+        config, lacking = self._compose(picks)
         self.check(config)
-        unused = tuple(axis.key for axis in lacking)
-        kept = [axis for axis in axes if axis not in lacking]
-        used = tuple(axis.key for axis in kept if axis.replaces)
+        used = tuple(axis.key for axis, _ in picks if axis.replaces and axis not in lacking)
         self.used.update(used)
-        for key in unused:
-            self.lacking.setdefault(key, []).append(config)
-        scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
-        overrides = tuple(fixed[axis.place] for axis in kept if axis.swept and axis.place in fixed)
+        choices = " ".join(_words(one for one in picks if one[0].is_choice))
+        for axis in lacking:
+            self.lacking.setdefault(axis.key, {})[choices] = config
+        if any(pick for axis, pick in picks if axis in lacking):
+            return  # the same as with the first value of what is lacking
+        swept = (axis for axis, _ in picks if axis.key == "seed" and len(axis.texts) > 1)
+        seeds = next((axis.values for axis in swept), ())
+        together = all(isinstance(seed, int) for seed in seeds) and _is_alone(config, "seed")
         present = [key for key in self.sections if key in config.keys()]  # noqa: SIM118
-        together = [axis for axis in scalars if axis.key == "seed" and _is_alone(config, "seed")]
-        ranges = [range(1 if axis in together else len(axis.texts)) for axis in scalars]
-        for picks in itertools.product(*ranges):
-            chosen = list(zip(scalars, picks, strict=True))
-            for axis, pick in chosen:
-                OmegaConf.update(config, axis.key, axis.values[pick])
-            apart = (axis.argument(pick) for axis, pick in chosen if axis not in together)
+        for number in range(1 if together else len(seeds) or 1):
+            if seeds:
+                OmegaConf.update(config, "seed", seeds[number])
             yield Combination(
                 settings={key: _resolved(config, key) for key in present},
-                seeds=together[0].values if together else None,
-                overrides=(*overrides, *apart),
+                seeds=seeds if seeds and together else None,
                 used=used,
-                unused=unused,
+                unused=tuple(axis.key for axis in lacking),
             )
 
     def check_all_used(self) -> None:
         """Refuse a key that no choice has, with the nearest name in its place."""
-        for key, configs in self.lacking.items():
+        for key, choices in self.lacking.items():
             if key in self.used:
                 continue
+            configs = choices.values()
             holder, _, last = key.rpartition(".")
             while holder and not any(has_key(config, holder) for config in configs):
                 holder, _, last = holder.rpartition(".")
@@ -167,29 +163,25 @@ class _Expansion:
             target = next(filter(None, targets), None)
             raise unknown_field(name, target, names) if target else unknown_setting(name, names)
 
-    def _compose(
-        self, axes: Sequence[Axis], fixed: Mapping[int, str]
-    ) -> tuple[DictConfig, list[Axis]]:
+    def _compose(self, picks: Sequence[Pick]) -> tuple[DictConfig, list[Axis]]:
         """Return the configuration, and the axes whose key this choice lacks."""
-        overrides = _in_order(axes, fixed)
-        composed = self.composer.attempt(overrides)
-        lacking = [] if composed is not None else self._lacking(axes, fixed)
+        words = _words(picks)
+        composed = self.composer.attempt(words)
+        lacking = [] if composed is not None else self._lacking(picks)
         if lacking:
-            kept = [axis for axis in axes if axis not in lacking]
-            overrides = _in_order(kept, fixed)
-            composed = self.composer.attempt(overrides)
-        return composed or self.composer.by_hydra(overrides), lacking
+            words = _words(one for one in picks if one[0] not in lacking)
+            composed = self.composer.attempt(words)
+        return composed or self.composer.by_hydra(words), lacking
 
-    def _lacking(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[Axis]:
-        replacing = [axis for axis in axes if axis.replaces]
-        others = [axis for axis in axes if axis not in replacing]
-        bare = self.composer.attempt(_in_order(others, fixed))
+    def _lacking(self, picks: Sequence[Pick]) -> list[Axis]:
+        bare = self.composer.attempt(_words(one for one in picks if not one[0].replaces))
+        replacing = (axis for axis, _ in picks if axis.replaces)
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
 
 
-def _in_order(axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[str]:
-    """Return an override for each axis: the one in ``fixed``, or the first value."""
-    return [fixed.get(axis.place) or axis.argument(0) for axis in axes]
+def _words(picks: Iterable[Pick]) -> list[str]:
+    """Return the overrides that set one value of each axis."""
+    return [axis.argument(pick) for axis, pick in picks]
 
 
 class _Composer:
@@ -222,7 +214,7 @@ class _Composer:
             choices = [one for one in parsed if self._is_choice(one)]
             key = tuple(str(one.input_line) for one in choices)
             if not self._latest[1] or self._latest[0] != key:
-                self._latest = key, pickle.dumps(self._chosen(choices))
+                self._latest = key, pickle.dumps(self._chosen(choices, key))
             config: DictConfig = pickle.loads(self._latest[1])
             for one in parsed:
                 if not self._is_choice(one):
@@ -230,8 +222,14 @@ class _Composer:
             return config
         return None
 
-    def _chosen(self, choices: Sequence[Override]) -> DictConfig:
-        """Return the configuration for choices of groups."""
+    def _chosen(self, choices: Sequence[Override], words: Sequence[str]) -> DictConfig:
+        """Return the configuration for choices of groups, which are the words."""
+        with contextlib.suppress(Exception):  # such as of an option that overrides another group
+            return self._exchanged(choices)
+        return self.by_hydra(words)
+
+    def _exchanged(self, choices: Sequence[Override]) -> DictConfig:
+        """Return the configuration in which options are put into their sections."""
         alone = {one.key_or_group: self._option(one) for one in choices if self._option(one)}
         frame = self._frame(choices, alone)
         written = [group for group in alone if group in frame]
@@ -288,10 +286,12 @@ class _Composer:
 
 def _apply(override: Override, config: DictConfig) -> None:
     """Set a value in a configuration; raise if only Hydra can, or if it has to refuse it."""
-    forced = override.type == OverrideType.FORCE_ADD
-    if override.package or not (forced or override.type == OverrideType.CHANGE):
+    key, kind = override.key_or_group, override.type
+    new = kind == OverrideType.ADD and not has_key(config, key)
+    if override.package or not (new or kind in (OverrideType.CHANGE, OverrideType.FORCE_ADD)):
         raise ConfigCompositionException(str(override.input_line))
-    OmegaConf.update(config, override.key_or_group, override.value(), merge=True, force_add=forced)
+    added = kind != OverrideType.CHANGE
+    OmegaConf.update(config, key, override.value(), merge=True, force_add=added)
 
 
 def _is_alone(config: DictConfig, key: str) -> bool:

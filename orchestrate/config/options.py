@@ -22,7 +22,7 @@ from fnmatch import fnmatchcase
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
@@ -71,27 +71,19 @@ class Axis:
         The values as Hydra would write them after the equals sign.
     values
         The values, typed by Hydra's grammar.
-    kind
-        ``choice`` of a group, ``scalar`` that replaces a value, or ``edit``: any other change of
-        the composed configuration, such as ``+k=1``, a list or a deletion.
-    place
-        Number of the override in its order.
+    is_choice
+        Whether it chooses options of a group.
     """
 
     key: str
     texts: tuple[str, ...]
     values: tuple[object, ...]
-    kind: Literal["choice", "scalar", "edit"]
-    place: int = 0
-
-    @property
-    def swept(self) -> bool:
-        return len(self.texts) > 1
+    is_choice: bool
 
     @property
     def replaces(self) -> bool:
         """Whether the override sets an existing key: not a group, and without ``+`` or ``~``."""
-        return self.kind != "choice" and self.key[0] not in "+~"
+        return not self.is_choice and self.key[0] not in "+~"
 
     def argument(self, index: int) -> str:
         """Return the override that sets value ``index``."""
@@ -116,8 +108,7 @@ def read_axes(loader: ConfigLoader, arguments: Sequence[str]) -> list[Axis]:
         merged = _is_mapping(one)
         kept = [k for k in kept if k.get_key_element() != key or (merged and _is_mapping(k))]
         kept.append(one)
-    axes = [dataclasses.replace(_axis(loader, one), place=i) for i, one in enumerate(kept)]
-    return [_without_clash(axis, axes) for axis in axes]
+    return [_axis(loader, one) for one in kept]
 
 
 def parsed_overrides(
@@ -222,13 +213,11 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         texts = tuple(map(_text, found))
         values = tuple(one.text if isinstance(one, QuotedString) else one for one in found)
     options = loader.get_group_options(override.key_or_group, results_filter=None)
-    if options and not any(isinstance(value, dict) for value in values):
-        if None in values:
-            names = _every_option(loader, override.key_or_group)
-            raise unknown_name(override.key_or_group, "null", names)
-        return Axis(key, texts, values, "choice")
-    scalar = override.type == OverrideType.CHANGE and override.package is None
-    return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
+    is_choice = bool(options) and not any(isinstance(value, dict) for value in values)
+    if is_choice and None in values:
+        names = _every_option(loader, override.key_or_group)
+        raise unknown_name(override.key_or_group, "null", names)
+    return Axis(key, texts, values, is_choice)
 
 
 def _check_key(override: Override) -> None:
@@ -306,26 +295,6 @@ def _text(value: Any) -> str:
     if isinstance(value, str) and parsed_overrides([f"k={text}"])[0].value() != value:
         return QuotedString(value, Quote.single).with_quotes()
     return text
-
-
-def _plain(value: object) -> bool:
-    """Return whether ``value`` is a plain value, with no interpolation."""
-    if isinstance(value, str):
-        return "${" not in value and value != "???"
-    return value is None or isinstance(value, bool | int | float)
-
-
-def _without_clash(axis: Axis, axes: Sequence[Axis]) -> Axis:
-    """Turn a scalar into an edit if another override changes the same part of the tree."""
-    edits = (_path(other.key) for other in axes if other is not axis and other.kind != "choice")
-    pairs = (zip(_path(axis.key), edit, strict=False) for edit in edits)
-    if axis.kind == "scalar" and any(all(a == b for a, b in one) for one in pairs):
-        return dataclasses.replace(axis, kind="edit")
-    return axis
-
-
-def _path(key: str) -> list[str]:
-    return key.lstrip("+~").split("@")[0].split(".")
 
 
 CONFIGURATION = Path(__file__).resolve().parents[1] / "conf"
