@@ -31,7 +31,7 @@ from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.base import Executor, Run, executor_factory, make_executor
 from orchestrate.program import ROOT, answered, exit_code, say, tell
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
-from orchestrate.runner.saving import Heartbeat, RetryingStore, launch_record
+from orchestrate.runner.saving import RetryingStore, kept_alive, launch_record
 from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memory
 from orchestrate.store import (
     FINISHED,
@@ -134,7 +134,7 @@ def recorded_launch(
     with Store.open(settings.store_url, settings.lease, settings.patience) as store:
         launch = store.begin_launch(record)
         try:
-            with Heartbeat(store, launch, settings.lease):
+            with kept_alive(store, launch, settings.lease):
                 patient = RetryingStore(store, launch, settings.patience, output.warn)
                 try:
                     code = body(patient)

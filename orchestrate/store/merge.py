@@ -109,7 +109,7 @@ _ARRAYS = [one.name for one in trajectory_table.columns][1:]
 
 def _by_trial(rows: Iterable[Row[Any]]) -> dict[int, list[tuple[Any, ...]]]:
     """Return rows by their trial_id, the first column, without it."""
-    found = defaultdict(list)
+    found = defaultdict[int, list[tuple[Any, ...]]](list)
     for row in rows:
         found[row[0]].append(tuple(row[1:]))
     return found
