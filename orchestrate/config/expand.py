@@ -16,7 +16,7 @@ import dataclasses
 import itertools
 import pickle
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import hydra
@@ -34,7 +34,6 @@ from orchestrate.config.options import (
     KNOWN,
     NOT_SWEPT,
     Axis,
-    parsed_overrides,
     read_axes,
     unknown_field,
     unknown_setting,
@@ -129,7 +128,7 @@ class _Expansion:
         self.check(config)
         used = tuple(axis.key for axis, _ in picks if axis.replaces and axis not in lacking)
         self.used.update(used)
-        choices = " ".join(_words(one for one in picks if one[0].is_choice))
+        choices = " ".join(_words(_choices(picks)))
         for axis in lacking:
             self.lacking.setdefault(axis.key, {})[choices] = config
         if any(pick for axis, pick in picks if axis in lacking):
@@ -165,16 +164,15 @@ class _Expansion:
 
     def _compose(self, picks: Sequence[Pick]) -> tuple[DictConfig, list[Axis]]:
         """Return the configuration, and the axes whose key this choice lacks."""
-        words = _words(picks)
-        composed = self.composer.attempt(words)
+        composed = self.composer.attempt(picks)
         lacking = [] if composed is not None else self._lacking(picks)
         if lacking:
-            words = _words(one for one in picks if one[0] not in lacking)
-            composed = self.composer.attempt(words)
-        return composed or self.composer.by_hydra(words), lacking
+            picks = [one for one in picks if one[0] not in lacking]
+            composed = self.composer.attempt(picks)
+        return composed or self.composer.by_hydra(_words(picks)), lacking
 
     def _lacking(self, picks: Sequence[Pick]) -> list[Axis]:
-        bare = self.composer.attempt(_words(one for one in picks if not one[0].replaces))
+        bare = self.composer.attempt([one for one in picks if not one[0].replaces])
         replacing = (axis for axis, _ in picks if axis.replaces)
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
 
@@ -182,6 +180,10 @@ class _Expansion:
 def _words(picks: Iterable[Pick]) -> list[str]:
     """Return the overrides that set one value of each axis."""
     return [axis.argument(pick) for axis, pick in picks]
+
+
+def _choices(picks: Iterable[Pick]) -> list[Pick]:
+    return [(axis, pick) for axis, pick in picks if axis.chooses(pick)]
 
 
 class _Composer:
@@ -197,8 +199,6 @@ class _Composer:
         self._name = settings.job.config_name
         self._own = list(settings.overrides.hydra)
         self._usual = not settings.searchpath
-        self._parsed: dict[str, Override] = {}
-        self._is_group: dict[str, bool] = {}
         self._options: dict[str, DictConfig | None] = {}
         self._frames: dict[tuple[str, ...], bytes] = {}
         self._latest: tuple[tuple[str, ...], bytes] = ((), b"")
@@ -207,30 +207,30 @@ class _Composer:
         """Return the configuration that Hydra composes, or raise its error."""
         return hydra.compose(self._name, [*self._own, *overrides])
 
-    def attempt(self, overrides: Sequence[str]) -> DictConfig | None:
+    def attempt(self, picks: Sequence[Pick]) -> DictConfig | None:
         """Return the configuration, or None if Hydra has to compose it or raise an error."""
         with contextlib.suppress(Exception):
-            parsed = [self._override(word) for word in overrides]
-            choices = [one for one in parsed if self._is_choice(one)]
-            key = tuple(str(one.input_line) for one in choices)
+            choices = _choices(picks)
+            key = tuple(_words(choices))
             if not self._latest[1] or self._latest[0] != key:
-                self._latest = key, pickle.dumps(self._chosen(choices, key))
+                self._latest = key, pickle.dumps(self._chosen(choices))
             config: DictConfig = pickle.loads(self._latest[1])
-            for one in parsed:
-                if not self._is_choice(one):
-                    _apply(one, config)
+            for axis, pick in picks:
+                if not axis.chooses(pick):
+                    _apply(axis.override, axis.values[pick], config)
             return config
         return None
 
-    def _chosen(self, choices: Sequence[Override], words: Sequence[str]) -> DictConfig:
-        """Return the configuration for choices of groups, which are the words."""
+    def _chosen(self, choices: Sequence[Pick]) -> DictConfig:
+        """Return the configuration for choices of groups."""
         with contextlib.suppress(Exception):  # such as of an option that overrides another group
             return self._exchanged(choices)
-        return self.by_hydra(words)
+        return self.by_hydra(_words(choices))
 
-    def _exchanged(self, choices: Sequence[Override]) -> DictConfig:
+    def _exchanged(self, choices: Sequence[Pick]) -> DictConfig:
         """Return the configuration in which options are put into their sections."""
-        alone = {one.key_or_group: self._option(one) for one in choices if self._option(one)}
+        options = {axis.override.key_or_group: self._option(axis, pick) for axis, pick in choices}
+        alone = {group: option for group, option in options.items() if option}
         frame = self._frame(choices, alone)
         written = [group for group in alone if group in frame]
         if written:  # other files write to these sections
@@ -241,23 +241,23 @@ class _Composer:
                 frame[group] = option
         return frame
 
-    def _frame(self, choices: Sequence[Override], absent: Iterable[str]) -> DictConfig:
+    def _frame(self, choices: Sequence[Pick], absent: Collection[str]) -> DictConfig:
         """Return the configuration for choices, composed without some of their groups."""
-        words = tuple(
-            f"~{one.key_or_group}" if one.key_or_group in absent else str(one.input_line)
-            for one in choices
-        )
+        groups = [axis.override.key_or_group for axis, _ in choices]
+        pairs = zip(groups, _words(choices), strict=True)
+        words = tuple(f"~{group}" if group in absent else word for group, word in pairs)
         if words not in self._frames:
             self._frames[words] = pickle.dumps(self.by_hydra(words))
         frame: DictConfig = pickle.loads(self._frames[words])
         return frame
 
-    def _option(self, choice: Override) -> DictConfig | None:
+    def _option(self, axis: Axis, pick: int) -> DictConfig | None:
         """Return the content of an option that has no defaults and fills the section of its group.
 
         It is None for every other option.
         """
-        group, option = choice.key_or_group, choice.value()
+        choice, option = axis.override, axis.values[pick]
+        group = choice.key_or_group
         if choice.type != OverrideType.CHANGE or choice.package or not isinstance(option, str):
             return None
         path = f"{group}/{option}"
@@ -270,28 +270,15 @@ class _Composer:
             self._options[path] = content if plain else None  # type: ignore[assignment]
         return self._options[path]
 
-    def _is_choice(self, override: Override) -> bool:
-        """Return whether an override chooses an option of a group, as Hydra decides it."""
-        group = override.key_or_group
-        if group not in self._is_group:
-            options = self.loader.get_group_options(group, results_filter=None)
-            self._is_group[group] = bool(options)
-        return self._is_group[group] and not isinstance(override.value(), dict)
 
-    def _override(self, word: str) -> Override:
-        if word not in self._parsed:
-            [self._parsed[word]] = parsed_overrides([word], self.loader)
-        return self._parsed[word]
-
-
-def _apply(override: Override, config: DictConfig) -> None:
+def _apply(override: Override, value: object, config: DictConfig) -> None:
     """Set a value in a configuration; raise if only Hydra can, or if it has to refuse it."""
     key, kind = override.key_or_group, override.type
     new = kind == OverrideType.ADD and not has_key(config, key)
     if override.package or not (new or kind in (OverrideType.CHANGE, OverrideType.FORCE_ADD)):
         raise ConfigCompositionException(str(override.input_line))
     added = kind != OverrideType.CHANGE
-    OmegaConf.update(config, key, override.value(), merge=True, force_add=added)
+    OmegaConf.update(config, key, value, merge=True, force_add=added)
 
 
 def _is_alone(config: DictConfig, key: str) -> bool:

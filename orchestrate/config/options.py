@@ -65,25 +65,34 @@ class Axis:
 
     Attributes
     ----------
-    key
-        Configuration key or group as typed, with its prefix ``+``, ``++`` or ``~`` and its package.
+    override
+        Key or group, type and package, by Hydra's grammar.
     texts
         The values as Hydra would write them after the equals sign.
     values
         The values, typed by Hydra's grammar.
-    is_choice
-        Whether it chooses options of a group.
+    is_group
+        Whether the key is a group, of which a value that is no mapping chooses an option.
     """
 
-    key: str
+    override: Override
     texts: tuple[str, ...]
     values: tuple[object, ...]
-    is_choice: bool
+    is_group: bool
+
+    @property
+    def key(self) -> str:
+        """Key as typed, with its prefix ``+``, ``++`` or ``~`` and its package."""
+        return str(self.override.get_key_element())
 
     @property
     def replaces(self) -> bool:
-        """Whether the override sets an existing key: not a group, and without ``+`` or ``~``."""
-        return not self.is_choice and self.key[0] not in "+~"
+        """Whether the override sets an existing key: no option, and without ``+`` or ``~``."""
+        return not all(map(self.chooses, range(len(self.values)))) and self.key[0] not in "+~"
+
+    def chooses(self, index: int) -> bool:
+        """Return whether value ``index`` is an option of a group."""
+        return self.is_group and not isinstance(self.values[index], dict)
 
     def argument(self, index: int) -> str:
         """Return the override that sets value ``index``."""
@@ -196,7 +205,6 @@ def _range_values(sweep: RangeSweep) -> list[int] | list[float]:
 
 
 def _axis(loader: ConfigLoader, override: Override) -> Axis:
-    key = override.get_key_element()
     texts: tuple[str, ...]
     values: tuple[object, ...]
     value: object = override.value()
@@ -211,13 +219,12 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         _check_key(override)
         found = _swept_values(override)
         texts = tuple(map(_text, found))
-        values = tuple(one.text if isinstance(one, QuotedString) else one for one in found)
+        values = tuple(map(Override._convert_value, found))
     options = loader.get_group_options(override.key_or_group, results_filter=None)
-    is_choice = bool(options) and not any(isinstance(value, dict) for value in values)
-    if is_choice and None in values:
+    if options and None in values:
         names = _every_option(loader, override.key_or_group)
         raise unknown_name(override.key_or_group, "null", names)
-    return Axis(key, texts, values, is_choice)
+    return Axis(override, texts, values, bool(options))
 
 
 def _check_key(override: Override) -> None:
