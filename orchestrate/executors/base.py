@@ -232,7 +232,7 @@ class ExecutorFactory:
     in_process
         Whether trials run in the process of the launch; a single trial then uses this executor.
     options
-        Settings of the section ``executor``, beside its name.
+        Settings of the section ``executor``, beside its name; None where it takes any.
     limiting_key
         Key that reduces ``trials_at_once``.
     """
@@ -242,7 +242,7 @@ class ExecutorFactory:
     check: Callable[[LaunchSettings], None] = lambda _: None
     path: str = "kernel"
     in_process: bool = False
-    options: tuple[str, ...] = ()
+    options: tuple[str, ...] | None = None
     limiting_key: str = "launch.workers"
 
 
@@ -263,7 +263,7 @@ def executor_factory(settings: LaunchSettings) -> ExecutorFactory:
         raise unknown_name("executor.name", settings.executor, EXECUTORS)
     factory: ExecutorFactory = import_module(EXECUTORS[settings.executor]).FACTORY
     for name in settings.executor_options:
-        if name not in factory.options:
+        if factory.options is not None and name not in factory.options:
             raise unknown_name("setting of executor", name, factory.options)
     return factory
 
@@ -319,4 +319,5 @@ FACTORY = ExecutorFactory(
     make=lambda settings, run, _: InProcessExecutor(run, limits_of(settings)),
     trials_at_once=lambda _: 1,
     in_process=True,
+    options=(),
 )
