@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from orchestrate.program import answered, run
+from orchestrate.program import answered, check_removed, run
 
 if __name__ == "__main__":
     run("orchestrate.__main__")  # what cannot be imported is answered, too
@@ -41,6 +41,7 @@ def main(words: Sequence[str] | None = None) -> int:
     name, *rest = given
     commands = {command.name: command for command in COMMANDS}
     if name not in commands:
+        check_removed(f"orchestrate {name}")
         raise unknown_name("command", name, commands)
     return commands[name].run(commands[name].parser().read(rest, mixed=True))
 

@@ -37,6 +37,44 @@ _INSTALLED = {
 }
 
 
+SUCCESSORS = {
+    "analysis --band": "v_trial has every final loss, of which SQL or pandas give quantiles",
+    "analysis --figures": "open README.md in the folder of figures",
+    "analysis --color-by": "the first setting of --group-by decides about the colours of figure 1",
+    "analysis --diverged": "analysis.load().trials() has every final loss, for pandas' fillna",
+    "analysis --workers": "one process draws all outputs of the paper's grid in seconds",
+    "comparison_control": "python -m analysis report has a table of success and cost of control",
+    "figure4_width": "python -m studies.speed.scaling q_dual prints the cost of a step",
+    "figure4_width_loss": "python -m analysis summary --group-by width shows the losses",
+    "figure5_control": "python -m analysis report has a table of success and cost of control",
+    "figure7_profiles": "python -m analysis aggregate compares over all systems",
+    "figure8_sensitivity": "python -m analysis summary --group-by learner.window shows each value",
+    "figure9_limits": "the page of a trial in python -m analysis serve shows its bounded states",
+    "orchestrate vacuum": "sqlite3 FILE VACUUM, or VACUUM in psql, gives the space back",
+    "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
+    "--live": "look at the progress of a launch with watch python -m orchestrate status",
+    "launch.live": "look at the progress of a launch with watch python -m orchestrate status",
+    "status --watch": "watch python -m orchestrate status repeats it",
+    "launch.reference": "compare with python -m analysis compare --reference POLICY",
+    "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
+    "launch.until='ci<5%'",
+    "export mlflow": "run studies/trackers/mlflow_runs.py on a SQLite file",
+    "export wandb": "run studies/trackers/wandb_runs.py on a SQLite file",
+    "export npz": "analysis.load() gives matrices and trajectories in Python, for numpy.savez",
+    "export bundle": "copy trials into a file with python -m orchestrate merge OTHER --db "
+    "sqlite:///FILE, or export trials, curves, trajectories and assessments as Parquet",
+    "analysis yardsticks": "python -m studies.yardsticks makes these tables",
+    "executor=slurm": "register the grid with launch.detach=true, and submit its workers with "
+    "sbatch docs/example/slurm_workers.sh",
+    "store=shards": "docs/example/share.sh runs a share of the seeds and copies its database",
+    "launch.share": "docs/example/share.sh runs a share of the seeds and copies its database",
+    "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
+    "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
+    "experiment=flex_table1_agents": "studies/agents/README.md has it as experiment=agents",
+}
+"""Successors of removed words, by command and word or by ``key=value`` of the configuration."""
+
+
 class UsageError(DoptError):
     """Invalid command-line arguments.
 
@@ -60,6 +98,7 @@ class Parser(argparse.ArgumentParser):
         read = self.parse_known_intermixed_args if mixed else self.parse_known_args
         arguments, unknown = read(list(words))
         for word in unknown:
+            check_removed(f"{self.prog} {word.split('=')[0]}")
             if word.startswith("-"):
                 options = {one for one in _options(self, words) if one.startswith("--")}
                 raise UsageError(f"{unknown_name('option', word.split('=')[0], options)}")
@@ -73,6 +112,7 @@ class Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a value outside the choices, with the nearest one."""
         if action.choices is not None and value not in action.choices:
+            check_removed(f"{self.prog} {value}")
             name = max(action.option_strings, key=len, default=action.metavar or action.dest)
             names = [str(choice) for choice in action.choices]
             raise UsageError(f"{unknown_name(str(name).lower(), value, names)}")
@@ -116,6 +156,24 @@ def _options(parser: argparse.ArgumentParser, words: Sequence[str]) -> Iterator[
         if isinstance(action, argparse._SubParsersAction):
             for name in set(words) & set(action.choices):
                 yield from _options(action.choices[name], words)
+
+
+def removed_word(typed: str) -> str | None:
+    """Return what takes the place of a removed word; None if the text ends with no removed word.
+
+    ``typed`` may begin with what leads to the word, such as ``python -m analysis floor``.
+    """
+    words = f" {typed}".replace(" dopt-", " ")
+    for word, successor in SUCCESSORS.items():
+        if words.endswith(f" {word}"):
+            return f"'{word}' was removed: {successor}."
+    return None
+
+
+def check_removed(typed: str) -> None:
+    """Raise ``UsageError`` if a typed text ends with a removed word."""
+    if sentence := removed_word(typed):
+        raise UsageError(sentence)
 
 
 def positive(option: str, number: type[int] | type[float]) -> Callable[[str], float]:

@@ -19,7 +19,7 @@ from orchestrate.commands import Command, add_filters, answer, chosen
 from orchestrate.commands.results import counts
 from orchestrate.errors import ExitCode
 from orchestrate.files import whole
-from orchestrate.program import UsageError, path
+from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory, public
 from orchestrate.store.records import now, unpacked_trajectory
 from orchestrate.store.schema import OUTCOME_COLUMNS, STEP_VALUES, trial
@@ -319,6 +319,7 @@ def _target(arguments: argparse.Namespace) -> Path:
 def _format_of(path: Path) -> str:
     ending = path.suffix.removeprefix(".").lower()
     if ending not in FORMATS:
+        check_removed(f"export {ending}")
         raise UsageError(
             f"The name of {path} does not say its format, {', '.join(FORMATS)} are known: give "
             f"--format or such an ending."

@@ -33,7 +33,7 @@ from orchestrate.config.options import (
     parsed_overrides,
     register,
 )
-from orchestrate.program import Parser, UsageError, as_started
+from orchestrate.program import Parser, UsageError, as_started, check_removed
 
 PROGRAM = "python orchestrate/launch.py"
 LAUNCH_SECTIONS = ("launch", "store", "executor")
@@ -136,6 +136,8 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
     if flags.resolve and not (flags.cfg or flags.help):
         raise UsageError("--resolve goes with --cfg or --help: add one of them.")
     for word in flags.overrides:
+        check_removed(word)
+        check_removed(word.partition("=")[0])
         if _NEEDED.fullmatch(word):
             raise UsageError(
                 f"'{word}' deletes what a launch needs: leave it out, or give another value."

@@ -51,6 +51,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from dopt.errors import DoptError, SpecificationError, suggestion, unknown_name
 from dopt.registry import TARGET, imported
 from orchestrate.config import TRIAL_SECTIONS
+from orchestrate.program import removed_word
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
 """Groups and sections of the whole launch, which cannot be swept."""
@@ -429,6 +430,8 @@ def _unknown_option(given: str, options: Iterable[str]) -> str:
     """
     match = _OPTION.fullmatch(given)
     group, option = match.groups() if match else ("", given)
+    if sentence := removed_word(f"{group}={option}"):
+        return sentence
     unknown = unknown_name(group or "configuration", option, {*options, *option_names(group)})
     return f"{unknown} A file of another folder is found with --config-dir FOLDER."
 

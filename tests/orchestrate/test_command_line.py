@@ -22,6 +22,7 @@ from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import COMMANDS
 from orchestrate.__main__ import main as orchestrate
+from orchestrate.program import SUCCESSORS
 from orchestrate.runner import start
 from orchestrate.runner.start import Work
 from orchestrate.store import Reader, Store, StoreError, default_url
@@ -419,6 +420,21 @@ def test_a_grid_goes_on_when_its_output_is_closed(
     with Reader.open(url) as reader:
         rows = reader.rows("SELECT count(*) FROM trial WHERE status = 'done'")
         assert [tuple(row) for row in rows] == [(2,)]
+
+
+@pytest.mark.parametrize(
+    "word", [name for name in SUCCESSORS if name.startswith(("launch.", "executor=", "store="))]
+)
+def test_settings_of_a_launch(command_line: Callable[..., tuple[int, str, str]], word: str) -> None:
+    code, output, errors = command_line("-m", word if "=" in word else f"{word}=1")
+    assert (code, output) == (2, "")
+    assert errors == f"error: '{word}' was removed: {SUCCESSORS[word]}.\n"
+
+
+@pytest.mark.parametrize("words", [["work", "--live", "1"], ["work", "--live=1"]])
+def test_options(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert orchestrate(words) == 2
+    assert f"'--live' was removed: {SUCCESSORS['--live']}." in capsys.readouterr().err
 
 
 FROM_VARIABLE = "The database URL in the environment variable DOPT_DB cannot be read"

@@ -215,7 +215,9 @@ class TestWords:
             (("curves",), "No path is given to write to"),
             (("curves", "a.csv", "--out", "b.csv"), "Two paths are given to write to"),
             (("curvse", "a.csv"), "did you mean 'curves'"),
-            (("curves", "a.npz"), "csv, parquet are known: give --format"),
+            (("curves", "a.npz"), "'export npz' was removed: analysis.load() gives"),
+            (("curves", "a.csv", "--format", "npz"), "'export npz' was removed"),
+            (("bundle", "a"), "'export bundle' was removed: copy trials into a file with"),
         ],
     )
     def test_a_mistake_is_one_sentence(

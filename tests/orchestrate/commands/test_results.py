@@ -85,6 +85,7 @@ def test_every_command_has_help_and_the_common_options(command: Command, capsys:
         (["status", "more"], "unexpected argument 'more'"),
         (["query", "SELECT 1", "--limit", "0"], "a whole number above 0 is expected"),
         (["query", "SELECT 1", "--timeout", "nan"], "a number above 0 is expected"),
+        (["status", "--watch"], "'status --watch' was removed: watch python -m orchestrate"),
         (["show", "--seed", "one"], "a whole number from 0 to 2^63 - 1 is expected"),
         (["export", "curves", "--out", "x", "--format", "parket"], "did you mean 'parquet'?"),
         (["export", "curves", "--out", "curves.xlsx"], "give --format"),
