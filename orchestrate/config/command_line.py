@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig, OmegaConf
@@ -37,6 +36,24 @@ from orchestrate.program import Parser, UsageError, as_started, check_removed
 
 PROGRAM = "python orchestrate/launch.py"
 LAUNCH_SECTIONS = ("launch", "store", "executor")
+
+_SWITCHES = (
+    ("--help", "-h"),
+    ("--hydra-help",),
+    ("--version",),
+    ("--resolve",),
+    ("--run", "-r"),
+    ("--multirun", "-m"),
+    ("--shell-completion", "-sc"),
+)
+_OPTIONS = (
+    ("--package", "-p"),
+    ("--config-path", "-cp"),
+    ("--config-name", "-cn"),
+    ("--config-dir", "-cd"),
+    ("--experimental-rerun",),
+)
+_INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 _UNQUOTED = re.compile(r"(?s)(?!null$)[^'\"](?:(?!,\w+://).)*")
 """Database URL that may hold a character which Hydra takes in quotes alone; not several."""
@@ -75,8 +92,7 @@ def read_command_line() -> Request | None:
     Exception
         Errors of Hydra and of the grid.
     """
-    parser = Parser(prog=PROGRAM, add_help=False, parents=[get_args_parser()])
-    flags = _checked(parser.read(sys.argv[1:], mixed=True))
+    flags = _checked(_parser().read(sys.argv[1:], mixed=True))
     options = [word for word in sys.argv[1:] if word not in flags.overrides]
     words = [_quoted(word) for word in flags.overrides]
     sys.argv[1:] = [*options, *words]
@@ -115,6 +131,19 @@ def read_command_line() -> Request | None:
     if isinstance(request, Exception):
         raise request
     return request
+
+
+def _parser() -> Parser:
+    """Return a parser for the flags of Hydra."""
+    parser = Parser(prog=PROGRAM, add_help=False)
+    parser.add_argument("overrides", nargs="*")
+    for names in _SWITCHES:
+        parser.add_argument(*names, action="store_true")
+    for names in _OPTIONS:
+        parser.add_argument(*names)
+    parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+    parser.add_argument("--info", "-i", nargs="?", const="all", choices=_INFO)
+    return parser
 
 
 def _checked(flags: argparse.Namespace) -> argparse.Namespace:
