@@ -17,7 +17,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.runner.start import Work, launch_grid
+from orchestrate.runner.start import Output, Work, launch_grid
 from orchestrate.store import Claim, LaunchRecord, Reader, RunRecord, Store
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -131,7 +131,7 @@ def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Account
     settings = LaunchSettings(executor="local", store_url=url, workers=workers)
     grid = Grid(list(specs), n_jobs=len(specs), left_out={})
     work = Work(run_trial, compiling)
-    code = launch_grid(grid, settings, RECORD, work, say=_nothing, stream=None)
+    code = launch_grid(grid, settings, RECORD, work, Output(_nothing, _nothing))
     if code is not ExitCode.DONE:
         raise RuntimeError(f"the launch ended with {code!r}, but {ExitCode.DONE!r} is expected.")
     with Reader.open(url) as reader:

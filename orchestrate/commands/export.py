@@ -7,7 +7,6 @@ import hashlib
 import json
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,58 +105,52 @@ class ExportError(DoptError):
     """Empty selection, or file that cannot be written."""
 
 
-@dataclass(frozen=True)
-class Export:
-    """Request of an export: one of ``KINDS`` in one of ``FORMATS``, with filters."""
-
-    kind: str
-    format: str
-    out: Path
-    filters: Mapping[str, Sequence[str]]
-
-    @property
-    def manifest(self) -> Path:
-        return self.out.with_name(f"{self.out.name}.manifest.json")
-
-
-def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
+def export(
+    reader: Reader, configs: Sequence[ConfigRow], out: Path, arguments: argparse.Namespace
+) -> dict[str, Any]:
     """Write the file, and after it its manifest; return what the manifest says.
 
     Both appear whole or not at all. ``reader`` sees the moment of ``configs``. Raises
     ``ExportError``, or ``OutputError`` if they cannot be written.
     """
-    _expect_trials(reader, configs, wanted)
-    with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
-        content = _write(reader, configs, wanted, out)
-        with out.open("rb") as file:
+    kind, form = arguments.kind, arguments.format
+    filters = {"env": arguments.env, "policy": arguments.policy}
+    _expect_trials(reader, configs, kind)
+    with whole(_manifest(out)) as manifest, whole(out) as partial:
+        content = _write(reader, configs, kind, form, partial)
+        with partial.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": digest}
+        about = {"file": out.name, "bytes": partial.stat().st_size, "sha256": digest}
         document = {
-            "kind": wanted.kind,
-            "format": wanted.format,
+            "kind": kind,
+            "format": form,
             **about,
             **content,
-            **provenance(reader, configs, wanted.filters),
+            **provenance(reader, configs, filters),
         }
         manifest.write_text(json.dumps(document, indent=2) + "\n")
     return document
 
 
+def _manifest(out: Path) -> Path:
+    return out.with_name(f"{out.name}.manifest.json")
+
+
 def _write(
-    reader: Reader, configs: Sequence[ConfigRow], wanted: Export, out: Path
+    reader: Reader, configs: Sequence[ConfigRow], kind: str, form: str, out: Path
 ) -> dict[str, Any]:
     import pyarrow as pa  # other commands do without it
     from pyarrow import csv, parquet
 
-    if wanted.kind == "trajectories":
+    if kind == "trajectories":
         columns = _trajectory_columns(reader, configs)
         tables = _trajectories(reader, configs)
     else:
-        columns, sql = _SELECTED[wanted.kind]
+        columns, sql = _SELECTED[kind]
         tables = _selected(reader, configs, columns, sql)
     kinds = {name: pa.type_for_alias(kind) for name, kind in columns.items()}
     schema, rows = pa.schema(kinds), 0
-    if wanted.format == "csv":
+    if form == "csv":
         writer = csv.CSVWriter(out, schema)
     else:
         writer = parquet.ParquetWriter(out, schema, compression="zstd")
@@ -249,19 +242,19 @@ def _large(schema: pa.Schema, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.
     yield pa.Table.from_batches(waiting, schema)
 
 
-def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> None:
+def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], kind: str) -> None:
     if not configs:
         raise ExportError(
             f"{reader.safe_url} holds no trials yet: run a launch that writes to it first."
         )
-    if wanted.kind == "assessments" and not any(reader.measures(c.config_key) for c in configs):
+    if kind == "assessments" and not any(reader.measures(c.config_key) for c in configs):
         raise ExportError(
             "No trial of these was assessed, so that there are no assessments to export: run them "
             "with task=control."
         )
-    if wanted.kind != "trials" and not any(config.n_done + config.n_diverged for config in configs):
+    if kind != "trials" and not any(config.n_done + config.n_diverged for config in configs):
         raise ExportError(
-            f"No trial of these is done yet, so that there are no {wanted.kind} to export: run "
+            f"No trial of these is done yet, so that there are no {kind} to export: run "
             f"the launch, or see status."
         )
 
@@ -304,16 +297,11 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_export(arguments: argparse.Namespace) -> ExitCode:
     """Write the file and its manifest."""
     out = _target(arguments)
-    wanted = Export(
-        kind=arguments.kind,
-        format=arguments.format or _format_of(out),
-        out=out,
-        filters={"env": arguments.env, "policy": arguments.policy},
-    )
+    arguments.format = arguments.format or _format_of(out)
     with Reader.open(arguments.db) as reader, reader.moment() as moment:
-        document = export(moment, chosen(moment, arguments), wanted)
+        document = export(moment, chosen(moment, arguments), out, arguments)
     size = f"{document['rows']:,} rows, {document['bytes']:,} bytes"
-    line = f"{out}: {size}; from where: {wanted.manifest}"
+    line = f"{out}: {size}; from where: {_manifest(out)}"
     return answer(arguments, document, line)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain, zip_longest
 from typing import Any
@@ -37,15 +37,12 @@ class Combination:
         Sections of the resolved configuration.
     seeds
         Seeds of the configuration, or None for the one in ``settings``.
-    overrides
-        Swept overrides of this combination, as they would be typed.
     used, unused
         Keys set by the grid that exist in this choice of groups, and keys that do not.
     """
 
     settings: Mapping[str, Any]
     seeds: Sequence[Any] | None = None
-    overrides: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
 
@@ -139,72 +136,71 @@ LARGEST = 1_000_000_000
 _PRECISION = re.compile(r"ci\s*<\s*(\d+(?:\.\d+)?)\s*%")
 
 
-class _Section(dict[str, Any]):
-    """Settings, of which a missing one has been deleted."""
+def setting(
+    key: str,
+    value: object,
+    kind: type,
+    expected: str,
+    holds: Callable[[Any], object] = lambda _: True,
+    *,
+    null: bool = False,
+) -> Any:
+    """Return a value as ``kind``, or None where ``null`` allows it.
 
-    def __missing__(self, name: str) -> Any:
-        raise LaunchError(
-            f"an override deletes '{name}', which a launch needs: leave that override out."
-        )
-
-
-def section(key: str, value: object) -> Mapping[str, Any]:
-    """Return a mapping of settings."""
-    if isinstance(value, Mapping):
-        return _Section(value)
-    raise wrong(key, value, "a section with settings of its own")
-
-
-def flag(key: str, value: object) -> bool:
-    """Return a boolean."""
-    if isinstance(value, bool):
-        return value
-    raise wrong(key, value, "true or false")
-
-
-def text(key: str, value: object) -> str:
-    """Return a non-empty text."""
-    if isinstance(value, str) and value:
-        return value
-    raise wrong(key, value, "a text")
-
-
-def count(key: str, value: object) -> int | None:
-    """Return a positive whole number, or None."""
-    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
-        return value
-    raise wrong(key, value, "null or a whole number above 0")
-
-
-def limit(key: str, value: object, unit: str = "seconds") -> float | None:
-    """Return a positive number, or None for no limit."""
-    return None if value is None else amount(key, value, unit, "null or a number")
-
-
-def amount(key: str, value: object, unit: str = "seconds", kind: str = "a number") -> float:
-    """Return a positive number below :data:`LARGEST`."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < LARGEST:
-        return float(value)
-    raise wrong(key, value, f"{kind} of {unit} above 0 and below {LARGEST:,}")
-
-
-def factor(key: str, value: object, limit_key: str, limited: object) -> float | None:
-    """Return a factor by which a limit is raised, which has to be set; or None."""
-    if value is None:
+    Raises ``LaunchError`` if it has another type, or is not as ``holds`` says.
+    """
+    if value is None and null:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 < value <= 100:
-        raise wrong(key, value, "null or a factor above 1, at most 100,")
-    if limited is None:
-        raise LaunchError(
-            f"{key} is {value:g}, but there is no limit that it could raise: set {limit_key}, or "
-            f"leave {key} out."
-        )
-    return float(value)
+    numbers = (int, float) if kind is float else kind
+    of_kind = isinstance(value, numbers) and (kind is bool or not isinstance(value, bool))
+    if of_kind and holds(value):
+        return kind(value)
+    raise wrong(key, value, f"{'null or ' * null}{expected}")
 
 
 def wrong(key: str, value: object, expected: str) -> LaunchError:
     """Return the error for a setting with an invalid value."""
     return LaunchError(f"{key} is {value!r}, but {expected} is expected: change {key}.")
+
+
+def _amount(unit: str) -> str:
+    return f"a number of {unit} above 0 and below {LARGEST:,}"
+
+
+flag = partial(setting, kind=bool, expected="true or false")
+text = partial(setting, kind=str, expected="a text", holds=bool)
+count = partial(
+    setting, kind=int, expected="a whole number above 0", holds=lambda value: value > 0, null=True
+)
+_bounded = partial(setting, kind=float, holds=lambda value: 0 < value < LARGEST)
+_mapping = partial(setting, kind=dict, expected="a section with settings of its own")
+
+
+def section(key: str, value: object, names: Collection[str]) -> dict[str, Any]:
+    """Return a section of settings, of which none is missing or unknown."""
+    found: dict[str, Any] = _mapping(key, value)
+    for name in names:
+        if name not in found:
+            raise LaunchError(
+                f"an override deletes '{name}', which a launch needs: leave that override out."
+            )
+    for name in found:
+        if name not in names:
+            raise unknown_name(f"setting of {key}", name, names)
+    return found
+
+
+def factor(key: str, value: object, limit_key: str, limited: object) -> float | None:
+    """Return a factor by which a limit is raised, which has to be set; or None."""
+    found: float | None = setting(
+        key, value, float, "a factor above 1, at most 100,", lambda one: 1 < one <= 100, null=True
+    )
+    if found is not None and limited is None:
+        raise LaunchError(
+            f"{key} is {found:g}, but there is no limit that it could raise: set {limit_key}, or "
+            f"leave {key} out."
+        )
+    return found
 
 
 def precision(key: str, value: object) -> float | None:
@@ -232,12 +228,14 @@ def retried(key: str, value: object) -> str | None:
     raise unknown_name(key, value, RETRY)
 
 
-_SECTIONS = ("launch", "store", "executor")
 _CHECKS: Mapping[str, Callable[[str, object], Any]] = {
     **dict.fromkeys(("dry_run", "detach", "fail_fast"), flag),
-    **dict.fromkeys(("chunk_seconds", "lease", "patience"), amount),
-    **{"retry": retried, "until": precision, "workers": count, "timeout": limit},
-    "memory_gib": partial(limit, unit="GiB"),
+    **dict.fromkeys(
+        ("chunk_seconds", "lease", "patience"), partial(_bounded, expected=_amount("seconds"))
+    ),
+    **{"retry": retried, "until": precision, "workers": count},
+    "timeout": partial(_bounded, expected=_amount("seconds"), null=True),
+    "memory_gib": partial(_bounded, expected=_amount("GiB"), null=True),
 }
 """Checks of the settings of a launch that stand alone."""
 
@@ -305,7 +303,10 @@ class LaunchSettings:
         LaunchError
             If a value has the wrong type or is out of bounds.
         """
-        launch, store, executor = (section(name, given[name]) for name in _SECTIONS)
+        launch = section("launch", given["launch"], (*_CHECKS, "retry_memory", "ray"))
+        ray = section("launch.ray", launch["ray"], ("address",))
+        store = section("store", given["store"], ("url",))
+        executor = _mapping("executor", given["executor"])
         checked = {name: check(f"launch.{name}", launch[name]) for name, check in _CHECKS.items()}
         if checked["patience"] >= checked["lease"]:  # a launch gives up before its lease ends
             raise wrong(
@@ -313,12 +314,12 @@ class LaunchSettings:
             )
         return cls(
             **checked,
-            executor=text("executor.name", executor["name"]),
+            executor=text("executor.name", executor.pop("name", None)),
             store_url=stripped(text("store.url", store["url"]), "store.url", LaunchError),
             retry_memory=factor(
                 *("launch.retry_memory", launch["retry_memory"]),
                 *("launch.memory_gib", launch["memory_gib"]),
             ),
-            ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
-            executor_options={key: value for key, value in executor.items() if key != "name"},
+            ray_address=text("launch.ray.address", ray["address"]),
+            executor_options=executor,
         )

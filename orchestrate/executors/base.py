@@ -231,6 +231,8 @@ class ExecutorFactory:
         Execution path of the trials, "kernel" or "reference".
     in_process
         Whether trials run in the process of the launch; a single trial then uses this executor.
+    options
+        Settings of the section ``executor``, beside its name; None where it takes any.
     limiting_key
         Key that reduces ``trials_at_once``.
     """
@@ -240,6 +242,7 @@ class ExecutorFactory:
     check: Callable[[LaunchSettings], None] = lambda _: None
     path: str = "kernel"
     in_process: bool = False
+    options: tuple[str, ...] | None = None
     limiting_key: str = "launch.workers"
 
 
@@ -254,11 +257,14 @@ def executor_factory(settings: LaunchSettings) -> ExecutorFactory:
     Raises
     ------
     SpecificationError
-        For an unknown name, with the nearest valid one.
+        For an unknown name of an executor or a setting, with the nearest valid one.
     """
     if settings.executor not in EXECUTORS:
         raise unknown_name("executor.name", settings.executor, EXECUTORS)
     factory: ExecutorFactory = import_module(EXECUTORS[settings.executor]).FACTORY
+    for name in settings.executor_options:
+        if factory.options is not None and name not in factory.options:
+            raise unknown_name("setting of executor", name, factory.options)
     return factory
 
 
@@ -313,4 +319,5 @@ FACTORY = ExecutorFactory(
     make=lambda settings, run, _: InProcessExecutor(run, limits_of(settings)),
     trials_at_once=lambda _: 1,
     in_process=True,
+    options=(),
 )

@@ -254,6 +254,7 @@ def _standard_error() -> Iterator[int]:
 FACTORY = ExecutorFactory(
     make=lambda settings, run, _: LocalExecutor(run, settings.workers, limits_of(settings)),
     trials_at_once=lambda settings: settings.workers or usable_cores(),
+    options=(),
 )
 
 

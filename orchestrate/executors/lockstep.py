@@ -89,7 +89,7 @@ def run_batch(tasks: Sequence[Task], device: str) -> list[Event]:
 
 
 def _device(settings: LaunchSettings) -> str:
-    return text("executor.device", settings.executor_options.get("device", DEVICE))
+    return str(text("executor.device", settings.executor_options.get("device", DEVICE)))
 
 
 def _batch_size(settings: LaunchSettings) -> int:
@@ -113,5 +113,6 @@ FACTORY = ExecutorFactory(
     check=_check,
     path="reference",
     in_process=True,
+    options=("device", "batch"),
     limiting_key="executor.batch",
 )

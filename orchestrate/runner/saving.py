@@ -11,13 +11,13 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from dopt import __version__
 from dopt.result import TrialResult
@@ -174,32 +174,27 @@ JOIN_TIMEOUT_SECONDS = 2.0
 """Time for the last heartbeat to finish."""
 
 
-class Heartbeat:
-    """Context manager that renews the lease of a launch from a thread.
+@contextmanager
+def kept_alive(store: Store, launch: int, lease_seconds: float) -> Iterator[None]:
+    """Renew the lease of a launch from a thread while the block runs.
 
     It ignores a lost database, which the main thread notices too. A lease that has run out is
     renewed all the same: what others claimed meanwhile is refused when it is committed.
     """
+    ended = threading.Event()
 
-    def __init__(self, store: Store, launch: int, lease_seconds: float) -> None:
-        self._store = store
-        self._launch = launch
-        self._interval = lease_seconds / HEARTBEATS_PER_LEASE
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join(JOIN_TIMEOUT_SECONDS)
-
-    def _beat(self) -> None:
-        while not self._ended.wait(self._interval):
+    def beat() -> None:
+        while not ended.wait(lease_seconds / HEARTBEATS_PER_LEASE):
             with suppress(Exception):  # a failed heartbeat must not be the last one
-                self._store.heartbeat(self._launch)
+                store.heartbeat(launch)
+
+    thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(JOIN_TIMEOUT_SECONDS)
 
 
 _log = logging.getLogger("dopt.explorer")
@@ -252,7 +247,7 @@ class ExplorationSaver:
             if store.holds_more(spec, result):
                 return False
             self._launch = store.begin_launch(self._record)
-            self._alive.enter_context(Heartbeat(store, self._launch, LEASE_SECONDS))
+            self._alive.enter_context(kept_alive(store, self._launch, LEASE_SECONDS))
         last, self._last = self._last, None  # whether a save that fails has written is unknown
         known = result.wall_seconds if math.isfinite(result.wall_seconds) else 0.0
         started = datetime.now(UTC) - timedelta(seconds=known)
@@ -307,9 +302,6 @@ LIBRARIES = (
     "torch",
 )
 
-LARGEST_FILE_BYTES = 16 * 2**20
-"""Largest untracked file that is hashed; of a larger one the size is taken."""
-
 SOURCES = ("*.py", "*.yaml", "*.yml", "*.toml", ":(exclude)build", ":(exclude)dist")
 """Git path patterns of untracked files that can change a result: code and configuration."""
 
@@ -356,13 +348,8 @@ def _difference(root: Path) -> bytes:
 
 
 def _content(root: Path, name: bytes) -> bytes:
-    """Return the hash of a file, or its size if it is too large."""
-    path = root / os.fsdecode(name)
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE_BYTES:
-            return str(size).encode()
-        return hashlib.sha256(path.read_bytes()).digest()
+        return hashlib.sha256((root / os.fsdecode(name)).read_bytes()).digest()
     except OSError:
         return b"unreadable"
 

@@ -33,6 +33,7 @@ from dopt.types import Array
 from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost, executor_factory
+from orchestrate.executors.limits import BYTES_PER_GIB
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 from orchestrate.runner.progress import Tally
 from orchestrate.runner.saving import RetryingStore
@@ -128,7 +129,6 @@ class Chunks:
         return chunk
 
 
-BYTES_PER_GIB = 2**30
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 

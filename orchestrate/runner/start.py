@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, TextIO
 
@@ -31,7 +31,7 @@ from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.base import Executor, Run, executor_factory, make_executor
 from orchestrate.program import ROOT, answered, exit_code, say, tell
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
-from orchestrate.runner.saving import Heartbeat, RetryingStore, launch_record
+from orchestrate.runner.saving import RetryingStore, kept_alive, launch_record
 from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memory
 from orchestrate.store import (
     FINISHED,
@@ -83,17 +83,11 @@ class Output:
 
     say: Say
     warn: Say
-    progress: TextIO | None
+    progress: TextIO | None = None
 
 
 def launch_grid(
-    grid: Grid,
-    settings: LaunchSettings,
-    record: LaunchRecord,
-    work: Work,
-    say: Say,
-    stream: TextIO | None = None,
-    warn: Say | None = None,
+    grid: Grid, settings: LaunchSettings, record: LaunchRecord, work: Work, output: Output
 ) -> ExitCode:
     """Bring every trial of the grid to an outcome, or leave that to workers.
 
@@ -103,14 +97,8 @@ def launch_grid(
         Trials to run, and the settings of the launch.
     record
         Provenance of the command.
-    work
-        Functions that run a trial and prepare for it.
-    say
-        Takes the summary lines at the beginning and at the end.
-    stream
-        Destination of progress lines, or None for none.
-    warn
-        Takes messages about delays; by default ``say``.
+    work, output
+        Functions that run a trial and prepare for it, and destinations of messages.
 
     Raises
     ------
@@ -119,18 +107,13 @@ def launch_grid(
     StoreError, InfrastructureError
         If the database or the workers fail; nothing that was committed is lost.
     """
-    output = Output(say, warn or say, stream)
     if not settings.detach:
         executor_factory(settings).check(settings)
 
     def body(store: RetryingStore) -> ExitCode:
-        if settings.detach:
-            free_trials(store, grid, settings)
-            state = store.register(grid.trials)
-            counts = f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
-            say(f"{counts}; start workers with {WORKER} --db {shlex.quote(store.safe_url)}")
-            return ExitCode.DONE
-        return _run(store, grid, settings, work, output)
+        free_trials(store, grid, settings)
+        run = _GridRun(store, grid, settings, work, output)
+        return run.leave_to_workers() if settings.detach else run.until_all_ended()
 
     return recorded_launch(settings, record, output, body)
 
@@ -151,7 +134,7 @@ def recorded_launch(
     with Store.open(settings.store_url, settings.lease, settings.patience) as store:
         launch = store.begin_launch(record)
         try:
-            with Heartbeat(store, launch, settings.lease):
+            with kept_alive(store, launch, settings.lease):
                 patient = RetryingStore(store, launch, settings.patience, output.warn)
                 try:
                     code = body(patient)
@@ -175,65 +158,65 @@ _STATES = {
 }
 
 
-def _run(
-    store: RetryingStore,
-    grid: Grid,
-    settings: LaunchSettings,
-    work: Work,
-    output: Output,
-) -> ExitCode:
-    free_trials(store, grid, settings)
-    plan, tally = SeedPlan(grid, settings.until), Tally(0)
-    stages = _open_stages(store, plan, tally, settings, output.say)
-    first = next(stages, None)
-    if first is not None:
-        open_stages = itertools.chain([first], stages)
-        if _run_stages(open_stages, store, grid, tally, settings, work, output):
+@dataclass
+class _GridRun:
+    """Grid in the launch of ``store``, with the counts of its outcomes."""
+
+    store: RetryingStore
+    grid: Grid
+    settings: LaunchSettings
+    work: Work
+    output: Output
+    tally: Tally = field(default_factory=lambda: Tally(0))
+
+    def leave_to_workers(self) -> ExitCode:
+        state = self.store.register(self.grid.trials)
+        counts = f"{_counts(self.grid, state, 'running')}, {len(state.todo):,} registered"
+        url = shlex.quote(self.store.safe_url)
+        self.output.say(f"{counts}; start workers with {WORKER} --db {url}")
+        return ExitCode.DONE
+
+    def until_all_ended(self) -> ExitCode:
+        plan = SeedPlan(self.grid, self.settings.until)
+        stages = self._open_stages(plan)
+        first = next(stages, None)
+        if first is not None and self._is_interrupted(itertools.chain([first], stages)):
             return ExitCode.INTERRUPTED
-    if plan.adaptive and not tally.left:
-        output.say(plan.report())
-    return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
+        if plan.adaptive and not self.tally.left:
+            self.output.say(plan.report())
+        return ExitCode.SOME_FAILED if self.tally.all_failed else ExitCode.DONE
 
+    def _open_stages(self, plan: SeedPlan) -> Iterator[tuple[Grid, Registration]]:
+        """Register the stages of a launch one after the other; yield those with trials to run."""
+        for heading, stage in plan.stages(self.store.final_losses):
+            state = self.store.register(stage.trials)
+            self.tally.total = state.total
+            _count(self.tally, state)
+            said = opening(stage, state, self.settings, self.store.safe_url, heading)
+            self.output.say(said)
+            if self.tally.left:
+                yield stage, state
 
-def _open_stages(
-    store: RetryingStore, plan: SeedPlan, tally: Tally, settings: LaunchSettings, say: Say
-) -> Iterator[tuple[Grid, Registration]]:
-    """Register the stages of a launch one after the other; yield those with trials to run."""
-    for heading, stage in plan.stages(store.final_losses):
-        state = store.register(stage.trials)
-        tally.total = state.total
-        _count(tally, state)
-        say(opening(stage, state, settings, store.safe_url, heading))
-        if tally.left:
-            yield stage, state
-
-
-def _run_stages(
-    stages: Iterable[tuple[Grid, Registration]],
-    store: RetryingStore,
-    grid: Grid,
-    tally: Tally,
-    settings: LaunchSettings,
-    work: Work,
-    output: Output,
-) -> bool:
-    """Run the stages with one executor; return whether an interrupt left trials of them."""
-    configs = {trial.config_key: trial.config for trial in grid.trials}
-    with started(settings, work, configs.values(), output.warn) as executor, Interrupt() as stop:
-        start = time.monotonic()
-        chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
-        scheduler = Scheduler(
-            store, executor, chunks, tally, stop, settings.fail_fast, settings.retry_memory
-        )
-        for stage, state in stages:
-            chunks.add(_waiting(stage, state))
-            scheduler.owned_by_others = state.running_elsewhere
-            with Progress(tally, output.progress) as progress:
-                _drive(scheduler, stage, progress)
-            if tally.left:
-                break
-    output.say(closing(tally, scheduler.failures, stop.stop_requested, time.monotonic() - start))
-    return stop.stop_requested and tally.left > 0
+    def _is_interrupted(self, stages: Iterable[tuple[Grid, Registration]]) -> bool:
+        """Run the stages with one executor; return whether an interrupt left trials of them."""
+        settings, tally = self.settings, self.tally
+        configs = {trial.config_key: trial.config for trial in self.grid.trials}.values()
+        held = started(settings, self.work, configs, self.output.warn)
+        with held as executor, Interrupt() as stop:
+            start = time.monotonic()
+            chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
+            more = settings.fail_fast, settings.retry_memory
+            scheduler = Scheduler(self.store, executor, chunks, tally, stop, *more)
+            for stage, state in stages:
+                chunks.add(_waiting(stage, state))
+                scheduler.owned_by_others = state.running_elsewhere
+                with Progress(tally, self.output.progress) as progress:
+                    _drive(scheduler, stage, progress)
+                if tally.left:
+                    break
+        seconds = time.monotonic() - start
+        self.output.say(closing(tally, scheduler.failures, stop.stop_requested, seconds))
+        return stop.stop_requested and tally.left > 0
 
 
 @contextmanager
@@ -373,11 +356,9 @@ def worked(tally: Tally, scheduler: Scheduler, left: int, seconds: float) -> str
 def checked(request: Request) -> tuple[Grid, LaunchSettings]:
     """Return the checked grid and settings of a launch, or raise ``DoptError``."""
     from dopt.kernel import cache
-    from orchestrate.config.options import check_launch
 
     grid = build_grid(request.combinations, single=request.single)
     settings = LaunchSettings.from_mapping(request.launch)
-    check_launch(request.launch)
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)
@@ -420,7 +401,7 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
         return ExitCode.DONE
     record = launch_record(sys.argv, request.overrides, ROOT)
     if not request.single:
-        return launch_grid(grid, settings, record, WORK, say=say, stream=sys.stderr)
+        return launch_grid(grid, settings, record, WORK, Output(say, say, sys.stderr))
     code, line = launch_trial(grid.trials[0], settings, record, WORK)
     say(line)
     return code
@@ -440,14 +421,8 @@ def launch_trial(
         settings = dataclasses.replace(settings, executor="inprocess")
     before = _attempts(trial, settings.store_url)
     grid = Grid([trial], n_jobs=1, left_out={})
-    code = launch_grid(
-        grid,
-        settings,
-        record,
-        work,
-        say=lambda _: None,  # a single trial prints one line
-        warn=lambda text: tell(sys.stderr, f"{text}\n"),
-    )
+    quiet = Output(lambda _: None, lambda text: tell(sys.stderr, f"{text}\n"))  # one line is told
+    code = launch_grid(grid, settings, record, work, quiet)
     with Reader.open(settings.store_url) as reader:
         row = _row(reader, trial)
         if row is None:  # interrupted before it was registered

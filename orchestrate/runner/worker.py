@@ -22,12 +22,12 @@ from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config import LaunchSettings, factor
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task
+from orchestrate.executors.limits import BYTES_PER_GIB
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
 from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally, handling
 from orchestrate.runner.saving import RetryingStore, launch_record
 from orchestrate.runner.scheduler import (
-    BYTES_PER_GIB,
     MAX_CHUNK_TRIALS,
     SUSPECT_LOSSES,
     Chunks,

@@ -12,8 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, groupby
-from operator import itemgetter
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,6 @@ from orchestrate.store.schema import (
     assessment,
     attempt,
     config,
-    error,
     launch,
     trial,
 )
@@ -50,29 +48,15 @@ PAGE_STEPS = 5_000
 """Steps in one transaction, unless its only trial has more, which bounds the memory."""
 
 _TRIALS = (
-    f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, e.hash AS error_hash, "
+    f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, "
     f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' THEN 1 ELSE 0 END AS grows FROM trial r "
-    "JOIN config c ON c.config_id = r.config_id LEFT JOIN error e ON e.error_id = r.error_id "
+    "JOIN config c ON c.config_id = r.config_id "
     "WHERE r.trial_id > :last AND r.status IN ('done', 'diverged', 'failed', 'cancelled') "
     "ORDER BY r.trial_id LIMIT :size"
 )
 _ATTEMPTS = (
-    "SELECT a.*, e.hash AS error_hash FROM attempt a "
-    "LEFT JOIN error e ON e.error_id = a.error_id "
-    "WHERE a.trial_id BETWEEN :first AND :last AND a.outcome IS NOT NULL "
-    "ORDER BY a.trial_id, a.attempt"
-)
-_FINISHED = (
-    "trial_id IN (SELECT trial_id FROM trial WHERE trial_id BETWEEN :first AND :last "
-    "AND status IN ('done', 'diverged'))"
-)
-_STEPS = (
-    f"SELECT trial_id, t, {', '.join(STEP_VALUES)} FROM step WHERE {_FINISHED} ORDER BY trial_id, t"
-)
-_TRAJECTORIES = f"SELECT * FROM trajectory WHERE {_FINISHED}"
-_ASSESSMENTS = (
-    f"SELECT trial_id, t, measure, value FROM assessment WHERE {_FINISHED} "
-    "ORDER BY trial_id, t, measure"
+    "SELECT * FROM attempt WHERE trial_id BETWEEN :first AND :last AND outcome IS NOT NULL "
+    "ORDER BY trial_id, attempt"
 )
 # All trials of a configuration have the same number of assessments, except explorations, beside
 # the sample loss, which may have been stored of some alone.
@@ -103,6 +87,34 @@ class Curve:
     assessments: list[tuple[int, str, float | None]]
 
 
+def curves(connection: Connection, trial_ids: Sequence[int]) -> dict[int, Curve]:
+    """Return what is stored of trials; those that lack a trajectory, or a step, are left out."""
+    steps, arrays, assessments = (
+        _by_trial(connection.execute(select(table).where(table.c.trial_id.in_(trial_ids))))
+        for table in (step_table, trajectory_table, assessment)
+    )
+    found = {}
+    for trial_id, (row,) in arrays.items():
+        numbers = np.array(sorted(steps.get(trial_id, [])), np.float64)
+        numbers = numbers.reshape(-1, 1 + len(STEP_VALUES))
+        if np.array_equal(numbers[:, 0], np.arange(len(numbers))):
+            packed = dict(zip(_ARRAYS, row, strict=True))
+            rows = sorted(assessments.get(trial_id, []))
+            found[trial_id] = Curve(numbers[:, 1:], packed, rows)
+    return found
+
+
+_ARRAYS = [one.name for one in trajectory_table.columns][1:]
+
+
+def _by_trial(rows: Iterable[Row[Any]]) -> dict[int, list[tuple[Any, ...]]]:
+    """Return rows by their trial_id, the first column, without it."""
+    found = defaultdict[int, list[tuple[Any, ...]]](list)
+    for row in rows:
+        found[row[0]].append(tuple(row[1:]))
+    return found
+
+
 @dataclass(frozen=True)
 class Candidate:
     """Trial of the source that has an outcome, and its rows in other tables.
@@ -110,7 +122,7 @@ class Candidate:
     Attributes
     ----------
     row
-        Its row, with the name of its configuration and the hash of its error.
+        Its row, with the name of its configuration.
     attempts
         Finished attempts at it, the oldest first.
     curve
@@ -152,39 +164,22 @@ class Source:
         attempts = defaultdict(list)
         for row in self._dicts(_ATTEMPTS, **ends):
             attempts[row["trial_id"]].append(row)
-        steps = _by_trial(self._moment.rows(_STEPS, **ends))
-        assessments = _by_trial(self._moment.rows(_ASSESSMENTS, **ends))
-        trajectories = {row.pop("trial_id"): row for row in self._dicts(_TRAJECTORIES, **ends)}
+        finished = [row["trial_id"] for row in rows if row["status"] in FINISHED]
+        with self._moment._snapshot() as connection:
+            stored = curves(connection, finished)
         found = []
         for row in rows:
-            place = row["trial_id"]
-            rest = steps.get(place, []), trajectories.get(place), assessments.get(place, [])
-            curve = self._curve(row, *rest)
+            curve = stored.get(row["trial_id"])
+            if curve is not None and not self._is_whole(row, curve):
+                curve = None
             wrong = not (self._has_its_key(row) and _agree(row, curve))
-            found.append(Candidate(row, attempts[place], curve, wrong))
+            found.append(Candidate(row, attempts[row["trial_id"]], curve, wrong))
         return found
 
-    def _curve(
-        self,
-        row: Mapping[str, Any],
-        steps: Sequence[tuple[Any, ...]],
-        trajectory: Mapping[str, Any] | None,
-        assessments: list[tuple[Any, ...]],
-    ) -> Curve | None:
-        values = np.array(steps, np.float64).reshape(-1, 1 + len(STEP_VALUES))
+    def _is_whole(self, row: Mapping[str, Any], curve: Curve) -> bool:
         expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
-        if (
-            trajectory is None
-            or len(values) != row["n_rows"]
-            or not np.array_equal(values[:, 0], np.arange(len(values)))
-            or expected not in (None, len(_of_all(assessments)))
-        ):
-            return None
-        packed = {
-            name: bytes(one) if isinstance(one, memoryview) else one
-            for name, one in trajectory.items()
-        }
-        return Curve(values[:, 1:], packed, assessments)
+        n_assessments = len(_of_all(curve.assessments))
+        return len(curve.steps) == row["n_rows"] and expected in (None, n_assessments)
 
     def _has_its_key(self, row: Mapping[str, Any]) -> bool:
         """Return whether keys are hashes of what is stored: no specification is built of it."""
@@ -201,8 +196,8 @@ class Source:
         (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
         return row
 
-    def error(self, digest: str) -> dict[str, Any]:
-        (row,) = self._dicts("SELECT * FROM error WHERE hash = :hash", hash=digest)
+    def error(self, error_id: int) -> dict[str, Any]:
+        (row,) = self._dicts("SELECT * FROM error WHERE error_id = :id", id=error_id)
         return row
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
@@ -227,12 +222,6 @@ def _agree(row: Mapping[str, Any], curve: Curve | None) -> bool:
     return bool(same and fits and sizes == (2, 2, 1, steps + 1, DTYPE))
 
 
-def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]]]:
-    """Return the rows without their trial_id, the first column, by which they are sorted."""
-    groups = groupby(rows, key=itemgetter(0))
-    return {trial_id: [row[1:] for row in group] for trial_id, group in groups}
-
-
 def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
     """Return the assessments, (t, measure, value), that all trials of a configuration have."""
     return [tuple(one) for one in assessments if one[1] != SAMPLE_LOSS]
@@ -240,12 +229,8 @@ def _of_all(assessments: Iterable[Sequence[Any]]) -> list[tuple[Any, ...]]:
 
 _COPIED = ("status", *OUTCOME_COLUMNS)
 _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
-_ASSESSMENTS_HERE = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
-    assessment.c.t, assessment.c.measure
-)
 _INSERT_TRIALS = insert(trial).returning(trial.c.trial_key, trial.c.trial_id)
 _UPDATE_TRIAL = update(trial).where(trial.c.trial_id == bindparam("here"))
-_STEPS_HERE = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
 
 
 class Target:
@@ -263,6 +248,7 @@ class Target:
         self._source = source
         self._launches = launches
         self._configs: dict[str, int] = {}  # config_id here by key, filled on the way
+        self._errors: dict[int, int] = {}  # error_id here by the one there
         self._added: list[tuple[Candidate, Row[Any] | None]] = []
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
@@ -314,32 +300,9 @@ class Target:
             if rows:
                 self._connection.execute(insert(table), rows)
 
-    def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
-        """Return whether both databases hold equal numbers; times may differ."""
-        if any(getattr(here, name) != row[name] for name in ("status", "n_steps", "diverged_at")):
-            return False
-        where = here.trial_id
-        steps = self._connection.execute(_STEPS_HERE.where(step_table.c.trial_id == where)).all()
-        mine = np.array([tuple(one) for one in steps], dtype=np.float64)
-        arrays = self._connection.execute(
-            select(trajectory_table).where(trajectory_table.c.trial_id == where)
-        ).one_or_none()
-        rows = self._connection.execute(_ASSESSMENTS_HERE.where(assessment.c.trial_id == where))
-        return (
-            sorted(_of_all(rows)) == sorted(_of_all(there.assessments))
-            and mine.shape == there.steps.shape
-            and np.array_equal(mine[:, _NUMBERS], there.steps[:, _NUMBERS], equal_nan=True)
-            and arrays is not None
-            and all(getattr(arrays, name) == value for name, value in there.trajectory.items())
-        )
-
-    def steps_ahead(self, here: Row[Any], there: Curve) -> int | None:
-        """Return by how many steps an exploration is longer here; None if it is another one."""
-        statement = select(trajectory_table).where(trajectory_table.c.trial_id == here.trial_id)
-        mine = self._connection.execute(statement).mappings().one_or_none()
-        if mine is None:
-            return None
-        return steps_ahead(unpacked(dict(mine)), unpacked(there.trajectory))
+    def curve(self, here: Row[Any]) -> Curve | None:
+        """Return what is stored of a finished trial; None if some is missing."""
+        return curves(self._connection, [here.trial_id]).get(here.trial_id)
 
     def clear(self, here: Row[Any]) -> None:
         """Delete the rows of an exploration that has more steps in the source."""
@@ -354,7 +317,7 @@ class Target:
             values = {name: row[name] for name in _COPIED} | {"attempt": _last_attempt(one, here)}
             for name in ("launch_id", "registered_by"):
                 values[name] = self._launches.get(row[name])
-            values["error_id"] = self._error(row["error_hash"])
+            values["error_id"] = self._error(row["error_id"])
             if here is None:
                 values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
                 new.append(
@@ -377,7 +340,7 @@ class Target:
                 "trial_id": trial_id,
                 "attempt": number,
                 "launch_id": self._launches[row["launch_id"]],
-                "error_id": self._error(row["error_hash"]),
+                "error_id": self._error(row["error_id"]),
             }
 
     def _config(self, config_key: str, there: int) -> int:
@@ -392,16 +355,21 @@ class Target:
             self._configs[config_key] = int(here)
         return self._configs[config_key]
 
-    def _error(self, digest: str | None) -> int | None:
-        if digest is None:
-            return None
-        statement = select(error.c.error_id).where(error.c.hash == digest)
-        here = self._connection.execute(statement).scalar()
-        if here is None:
-            values = self._source.error(digest)
-            del values["error_id"]
-            return insert_error(self._connection, values)
-        return int(here)
+    def _error(self, there: int | None) -> int | None:
+        if there is not None and there not in self._errors:
+            self._errors[there] = insert_error(self._connection, self._source.error(there))
+        return None if there is None else self._errors[there]
+
+
+def _is_same(here: Row[Any], mine: Curve, row: Mapping[str, Any], there: Curve) -> bool:
+    """Return whether both databases hold equal numbers of a trial; times may differ."""
+    pairs = mine.steps[:, _NUMBERS], there.steps[:, _NUMBERS]
+    return (
+        all(getattr(here, name) == row[name] for name in ("status", "n_steps", "diverged_at"))
+        and _of_all(mine.assessments) == _of_all(there.assessments)
+        and np.array_equal(*pairs, equal_nan=True)
+        and mine.trajectory == there.trajectory
+    )
 
 
 def _last_attempt(one: Candidate, here: Row[Any] | None) -> int:
@@ -533,9 +501,11 @@ def _merge_trial(target: Target, one: Candidate, here: Row[Any] | None) -> str:
     if finished and curve is None:
         return "incomplete"
     if curve is not None and here is not None and here.status in FINISHED:
-        if target.is_same(here, row, curve):
+        mine, ahead = target.curve(here), None
+        if mine is not None and _is_same(here, mine, row, curve):
             return "identical"
-        ahead = target.steps_ahead(here, curve) if row["grows"] else None
+        if mine is not None and row["grows"]:
+            ahead = steps_ahead(unpacked(mine.trajectory), unpacked(curve.trajectory))
         if ahead is None or ahead == 0:
             return "conflicts"
         if ahead > 0:

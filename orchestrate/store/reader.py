@@ -388,17 +388,12 @@ def _kind(url: URL) -> ModuleType:
 def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:
     """Return (seed, status, t, value) rows, sorted by seed, as a matrix."""
     status = {seed: status for seed, status, _, _ in rows}
-    places = {seed: i for i, seed in enumerate(status)}
-    columns = {t: j for j, t in enumerate(sorted({t for _, _, t, _ in rows}))}
-    values = np.full((len(places), len(columns)), np.nan)
-    for seed, _, t, value in rows:
-        values[places[seed], columns[t]] = np.nan if value is None else value
-    return Assessments(
-        seeds=np.array([*places], dtype=np.int64),
-        t=np.array([*columns], dtype=np.int64),
-        values=values,
-        diverged=np.array([one == "diverged" for one in status.values()], dtype=np.bool_),
-    )
+    seeds, places = np.unique(np.array([row[0] for row in rows], np.int64), return_inverse=True)
+    t, columns = np.unique(np.array([row[2] for row in rows], np.int64), return_inverse=True)
+    values = np.full((len(seeds), len(t)), np.nan)
+    values[places, columns] = np.array([row[3] for row in rows], np.float64)
+    diverged = np.array([one == "diverged" for one in status.values()], dtype=np.bool_)
+    return Assessments(seeds, t, values, diverged)
 
 
 def _config(connection: Connection, config_key: str) -> tuple[int, int]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -277,56 +278,29 @@ class Store(Launches):
         self._backend.close()
 
 
-def _check_result(trial_key: str, result: TrialResult) -> None:
-    """Raise ``InvalidResultError`` if the arrays of a result are inconsistent."""
-    n = len(result.loss)
-    for name in STEP_VALUES:
-        _expect_shape(trial_key, result, name, (n,))
-    _expect_shape(trial_key, result, "states", (n + 1, None))
-    _expect_shape(trial_key, result, "inputs", (n, None))
-    _expect_shape(trial_key, result, "parameters", (None,))
-    _check_divergence(trial_key, result)
-    _check_assessments(trial_key, result)
-
-
-def _expect_shape(
-    trial_key: str, result: TrialResult, name: str, expected: tuple[int | None, ...]
-) -> None:
-    shape = np.shape(getattr(result, name))
-    fits = len(shape) == len(expected) and all(
-        want is None or got == want for got, want in zip(shape, expected, strict=True)
-    )
-    if not fits:
-        raise _refusal(
-            trial_key, f"'{name}' has shape {shape}, expected {expected} (None means any length)"
-        )
-
-
-def _check_divergence(trial_key: str, result: TrialResult) -> None:
+def _faults(result: TrialResult) -> Iterator[str]:
+    """Yield why a result is inconsistent; the first fault may be the cause of the others."""
+    n, at = len(result.loss), result.diverged_at
+    shapes: dict[str, tuple[int | None, ...]] = dict.fromkeys(STEP_VALUES, (n,))
+    shapes |= {"states": (n + 1, None), "inputs": (n, None), "parameters": (None,)}
+    for name, expected in shapes.items():
+        shape = np.shape(getattr(result, name))
+        if len(shape) != len(expected) or any(
+            want not in (None, got) for got, want in zip(shape, expected, strict=True)
+        ):
+            yield f"'{name}' has shape {shape}, expected {expected} (None means any length)"
     loss = np.isfinite(np.asarray(result.loss, dtype=np.float64))
-    at = result.diverged_at
     if at is None and not loss.all():
-        raise _refusal(
-            trial_key,
-            f"the loss of step {int(np.argmin(loss))} is not finite, but 'diverged_at' is None",
-        )
-    if at is not None and not 0 <= at < len(loss):
-        raise _refusal(trial_key, f"'diverged_at' is {at}, expected a step below {len(loss)}")
+        yield f"the loss of step {int(np.argmin(loss))} is not finite, but 'diverged_at' is None"
+    if at is not None and not 0 <= at < n:
+        yield f"'diverged_at' is {at}, expected a step below {n}"
     if at is not None and loss[at:].any():
-        raise _refusal(trial_key, f"there are losses after the divergence at step {at}")
-
-
-def _check_assessments(trial_key: str, result: TrialResult) -> None:
-    seen: set[tuple[int, str]] = set()
+        yield f"there are losses after the divergence at step {at}"
     for row in result.assessments:
         if not 0 <= row.t <= result.n_steps:
-            raise _refusal(
-                trial_key,
-                f"'{row.measure}' is of step {row.t}, expected one from 0 to {result.n_steps}",
-            )
-        if (row.t, row.measure) in seen:
-            raise _refusal(trial_key, f"'{row.measure}' of step {row.t} is given twice")
-        seen.add((row.t, row.measure))
+            yield f"'{row.measure}' is of step {row.t}, expected one from 0 to {result.n_steps}"
+    counts = Counter((row.t, row.measure) for row in result.assessments)
+    yield from (f"'{name}' of step {t} is given twice" for (t, name), k in counts.items() if k > 1)
 
 
 def _refusal(trial_key: str, reason: str) -> InvalidResultError:
@@ -401,7 +375,8 @@ class _Rows:
 
 def _prepare(claim: Claim, result: TrialResult, run: RunRecord) -> _Rows:
     """Check a result and return its rows; raise ``InvalidResultError`` if it is invalid."""
-    _check_result(claim.trial_key, result)
+    for fault in _faults(result):
+        raise _refusal(claim.trial_key, fault)
     steps = np.column_stack([getattr(result, name) for name in STEP_VALUES]).astype(np.float64)
     steps[~np.isfinite(steps)] = np.nan
     summary = {

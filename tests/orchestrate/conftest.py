@@ -14,7 +14,7 @@ from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
 from orchestrate.program import readable_streams
-from orchestrate.runner.start import Work, launch_grid
+from orchestrate.runner.start import Output, Work, launch_grid
 from orchestrate.store import LaunchRecord, Reader
 from tests.hydra_files import parse_once
 from tests.orchestrate.standins import quick, specification
@@ -37,7 +37,7 @@ class Launches:
         grid = Grid([specification(seed) for seed in range(seeds)], n_jobs=seeds, left_out={})
         chosen = LaunchSettings(executor=executor, store_url=self.url, **{"workers": 2, **settings})
         work = Work(run)
-        return launch_grid(grid, chosen, RECORD, work, self.said.append, stream=None)
+        return launch_grid(grid, chosen, RECORD, work, Output(*2 * [self.said.append]))
 
     def statuses(self) -> dict[int, str]:
         """Return the status of each seed."""

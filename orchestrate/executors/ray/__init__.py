@@ -30,4 +30,4 @@ def _trials_at_once(settings: LaunchSettings) -> int | None:
     return settings.workers or usable_cores()
 
 
-FACTORY = ExecutorFactory(_make, _trials_at_once)
+FACTORY = ExecutorFactory(_make, _trials_at_once, options=())

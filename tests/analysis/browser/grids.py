@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid, LaunchSettings
-from orchestrate.runner.start import Work, launch_grid
+from orchestrate.runner.start import Output, Work, launch_grid
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
 from tests.analysis.synthetic import fake_result, fill, make_grid
 from tests.orchestrate.faults.trials import Gate, Gated
@@ -123,7 +123,7 @@ def launch(url: str, seeds: int, folder: Path) -> int:
     record = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
     work = Work(Gated(fake_result, Gate(folder)))
     grid = Grid(specs, n_jobs=len(specs), left_out={})
-    return int(launch_grid(grid, settings, record, work, lambda _: None, stream=None))
+    return int(launch_grid(grid, settings, record, work, Output(print, print)))
 
 
 if __name__ == "__main__":

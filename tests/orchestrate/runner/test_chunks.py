@@ -14,10 +14,10 @@ from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
 from orchestrate.errors import LaunchError
+from orchestrate.executors.limits import BYTES_PER_GIB
 from orchestrate.records import RunRecord
 from orchestrate.runner.saving import RetryingStore
 from orchestrate.runner.scheduler import (
-    BYTES_PER_GIB,
     MAX_CHUNK_TRIALS,
     Chunks,
     check_memory,

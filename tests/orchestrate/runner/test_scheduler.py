@@ -19,7 +19,7 @@ from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Event, Executor, Task, WorkerLost, run_task
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
-from orchestrate.runner.start import Work, launch_grid
+from orchestrate.runner.start import Output, Work, launch_grid
 from orchestrate.store import Claim, Store, StoreUnavailableError
 from orchestrate.store.records import utc_text
 from tests.orchestrate.conftest import RECORD, Launches
@@ -135,7 +135,7 @@ def test_the_kernel_is_made_ready_where_a_trial_needs_it(
     grid = Grid(trials, n_jobs=len(trials), left_out={})
     settings = LaunchSettings("inprocess", f"sqlite:///{tmp_path / 'results.db'}")
     work = Work(quick, prepare)
-    assert launch_grid(grid, settings, RECORD, work, lambda _: None, stream=None) == ExitCode.DONE
+    assert launch_grid(grid, settings, RECORD, work, Output(print, print)) == ExitCode.DONE
     assert sum(map(len, calls)) == prepared
 
 

@@ -25,7 +25,7 @@ from orchestrate.runner.scheduler import (
     is_narrow,
     looks,
 )
-from orchestrate.runner.start import Work, launch_grid
+from orchestrate.runner.start import Output, Work, launch_grid
 from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.standins import diverged, grid_of, quick
 
@@ -83,7 +83,7 @@ class Adaptive(Launches):
         chosen = {"executor": "inprocess", "workers": 2, **settings}
         made = LaunchSettings(store_url=self.url, until=until, **chosen)  # type: ignore[arg-type]
         work = Work(run)
-        return launch_grid(of or grid(), made, RECORD, work, self.said.append, stream=None)
+        return launch_grid(of or grid(), made, RECORD, work, Output(*2 * [self.said.append]))
 
     @property
     def report(self) -> str:

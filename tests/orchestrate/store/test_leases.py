@@ -17,7 +17,7 @@ from dopt.run import run_trial
 from orchestrate.executors.base import Task, run_task
 from orchestrate.executors.limits import Limits
 from orchestrate.records import Failure
-from orchestrate.runner.saving import Heartbeat
+from orchestrate.runner.saving import kept_alive
 from orchestrate.store import Reader, Store
 from orchestrate.store.maintenance import examine
 from orchestrate.store.merge import Source, merge
@@ -63,7 +63,7 @@ def test_the_lease_is_renewed_while_the_main_thread_does_nothing(
     mine, others = open_store(), open_store()
     launch, (claim,) = begin(mine, Spec(0))
     lose(monkeypatch, ["question", "answer"], ["heartbeat"])
-    with Heartbeat(mine, launch, LEASE_SECONDS):
+    with kept_alive(mine, launch, LEASE_SECONDS):
         wait_for_renewals(url)
         assert others.recover() == 0
     assert mine.commit(claim, result(), RUN)
@@ -72,7 +72,7 @@ def test_the_lease_is_renewed_while_the_main_thread_does_nothing(
 def test_without_it_the_trials_are_taken(open_store: Callable[..., Store]) -> None:
     mine, others = open_store(LEASE), open_store(LEASE)
     launch, (claim,) = begin(mine, Spec(0))
-    with Heartbeat(mine, launch, LEASE):
+    with kept_alive(mine, launch, LEASE):
         assert [thread.name for thread in threading.enumerate()].count("heartbeat") == 1
     assert "heartbeat" not in [thread.name for thread in threading.enumerate()]
     until(others.recover, lambda: "the lease does not end")
@@ -119,7 +119,7 @@ def test_a_trial_in_compiled_code_does_not_silence_it(
     monkeypatch.setattr("dopt.kernel.run.FIRST_STEPS", 10)
     monkeypatch.setattr(KernelTrial, "advance", compiled_advance)
     monkeypatch.setattr(store, "heartbeat", counted)
-    with Heartbeat(store, launch, LEASE_SECONDS), running(take_what_is_free, url) as (_, pipe):
+    with kept_alive(store, launch, LEASE_SECONDS), running(take_what_is_free, url) as (_, pipe):
         [claim] = store.claim(launch, store.register(launch, [Spec(0)]).todo)
         assert hear(pipe) == "watching"
         ran = run_task(run_trial, Task(spec.trial_key, spec), Limits(seconds=PATIENCE_SECONDS))
