@@ -25,7 +25,6 @@ from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.limits import VIOLATIONS, WORST
 from dopt.models import MLP, Linear, Model
-from dopt.models.linear import linear_terms
 from dopt.offline_fit import sample_loss
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
@@ -149,10 +148,6 @@ def coverage(points: Array, box: Box, cells: int = CELLS) -> float:
     return float(np.mean(counts > 0))
 
 
-TOLERANCE = 1e-9
-"""Relative difference of two mean squares of regressors that counts as rounding."""
-
-
 def true_parameters(system: System, step: int = 0, names: Sequence[str] = ()) -> Array:
     """Return the true values, (q,), of physical parameters at a step, in their units.
 
@@ -181,33 +176,6 @@ def parameter_error(
     They are the named parameters, or by default the linear model's.
     """
     return float(np.linalg.norm(np.asarray(parameters) - true_parameters(system, step, names)))
-
-
-def loss_by_parameter_error(system: System) -> float:
-    """Return c such that the loss of the linear model is c ‖θ - θ*‖₂ for every θ.
-
-    The squared loss is (θ - θ*)ᵀ G (θ - θ*), with G the mean of ΨᵀΨ over the evaluation grid. It is
-    a multiple of the squared parameter error if G = c² I.
-
-    Raises
-    ------
-    SpecificationError
-        If G is no multiple of the identity matrix, or the system changes with time.
-    """
-    q, points = len(true_parameters(system)), evaluation_set(system)
-    at = system.points(points.states, points.inputs)[: points.n_grid]
-    _, regressors = linear_terms(system, at)
-    G = np.einsum("nri,nrj->ij", regressors, regressors) / len(at)
-    square = float(G[0, 0])
-    if len(system.history) > 1 or not np.allclose(
-        G, square * np.eye(q), rtol=0.0, atol=TOLERANCE * abs(square)
-    ):
-        raise SpecificationError(
-            f"the loss of env '{system.name}' weighs its parameters differently, but a parameter "
-            f"error follows from a loss that weighs all alike: run the trials again with "
-            f"dopt.run and compare their parameters."
-        )
-    return float(np.sqrt(square))
 
 
 KEPT_OUTCOMES = 4096

@@ -33,7 +33,7 @@ from analysis.data.matching import (
 from analysis.data.selection import Entry, environment_rank, policy_rank
 from analysis.style import of_finished
 from dopt.assessment import SAMPLE_LOSS, Plane
-from dopt.limits import VIOLATIONS, limits_from
+from dopt.limits import limits_from
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
@@ -103,19 +103,6 @@ def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array
         return {}
     bounds = limits.of_states(system)
     return {int(i): bounds[i] for i in np.flatnonzero(np.isfinite(bounds).any(axis=1))}
-
-
-def violation_shares(reader: Reader, entry: Entry) -> dict[int, float]:
-    """Return the share of steps after which a bound is exceeded, by the seed of a finished trial.
-
-    Steps before a trial diverged count. Trials without limits have none.
-    """
-    found = reader.assessments(entry.config.config_key, VIOLATIONS)
-    values = found.values / np.maximum(found.t, 1)
-    counted = dict(zip(found.seeds.tolist(), values, strict=True))
-    rows = {one.seed: counted[one.seed] for one in entry.finished if one.seed in counted}
-    finite = {seed: row[np.isfinite(row)] for seed, row in rows.items()}
-    return {seed: float(row.sum()) for seed, row in finite.items() if len(row)}
 
 
 def sample_losses(reader: Reader, entry: Entry) -> dict[int, float]:
