@@ -70,6 +70,27 @@ def finite(what: str, given: npt.ArrayLike, size: int) -> Array:
     return values
 
 
+def rows_of(what: str, given: npt.ArrayLike, size: int) -> Array:
+    """Return rows of so many real numbers, (N, size), or raise SpecificationError."""
+    values = np.atleast_2d(reals(what, given))
+    if values.ndim != 2 or values.shape[1] != size:
+        raise SpecificationError(
+            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
+            f"them."
+        )
+    return values
+
+
+def check_finite(what: str, values: Array) -> None:
+    """Raise SpecificationError unless all numbers of some rows are finite."""
+    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(wrong):
+        raise SpecificationError(
+            f"row {wrong[0]} of the {what} is {values[wrong[0]].tolist()}, but finite numbers are "
+            f"expected: give a part without such rows."
+        )
+
+
 def safe_input(spec: TrialSpec, fallback: npt.ArrayLike | None) -> Array:
     """Return the fallback, (m,), 0 unless it is given, or raise SpecificationError."""
     m, gamma = spec.system.n_inputs, spec.system.gamma

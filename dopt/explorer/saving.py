@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from dopt.arguments import reals, whole
+from dopt.arguments import check_finite, reals, whole
 from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
@@ -112,7 +112,8 @@ def free_run_error(
     first = 0 if isinstance(rows, slice) else max(steps, 1)  # in which the filter settles
     n = (len(u) - first) // max(steps, 1)
     _check_shapes(system, y, u, steps, n)
-    _check_finite(y, u)
+    check_finite("states", y)
+    check_finite("inputs", u)
     u = InFlight(system).acted(u)
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
@@ -152,16 +153,6 @@ def _check_shapes(system: System, run: Array, inputs: Array, steps: int, n: int)
             f"for predictions of {steps} steps, but shapes (T + 1, {d}) and (T, {m}) with at least "
             f"so many steps T{alone} are expected: correct it."
         )
-
-
-def _check_finite(run: Array, inputs: Array) -> None:
-    for what, rows in (("states", run), ("inputs", inputs)):
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        if len(bad):
-            raise SpecificationError(
-                f"a run was given in which the {what} of row {bad[0]} are {rows[bad[0]].tolist()}, "
-                f"but finite numbers are expected: give a part of the run without such rows."
-            )
 
 
 # States, inputs, errors and predictions of an exploration so far.

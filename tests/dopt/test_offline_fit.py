@@ -134,10 +134,10 @@ def test_recorded_samples_are_what_the_learner_was_given(env: str) -> None:
     [
         ({"ridge": 0}, "ridge is 0, but a number above 0 is expected"),
         ({"ridge": float("nan")}, "ridge is nan"),
-        ({"max_steps": 0}, "max_steps is 0, but at least 1"),
-        ({"states": np.zeros((60, 1))}, r"states have the shape \(60, 1\)"),
+        ({"max_steps": 0}, "max_steps is 0, but a whole number of at least 1"),
+        ({"states": np.zeros((60, 1))}, r"states of shape \(60, 1\)"),
         ({"accelerations": np.zeros((59, 1))}, "60 states and 59 accel"),
-        ({"states": np.full((60, 2), np.nan)}, "states hold a number that is not finite"),
+        ({"states": np.full((60, 2), np.nan)}, r"row 0 of the states is \[nan, nan\], but finite"),
     ],
 )
 def test_bad_input_gets_a_sentence(changes: dict[str, Any], words: str) -> None:
