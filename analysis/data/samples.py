@@ -33,7 +33,8 @@ from analysis.data.matching import (
 from analysis.data.selection import Entry, environment_rank, policy_rank
 from analysis.style import of_finished
 from dopt.assessment import SAMPLE_LOSS, Plane
-from dopt.limits import limits_from
+from dopt.limits import LIMITS
+from dopt.registry import build_optional
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
@@ -98,7 +99,7 @@ def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array
 
     Bounds are in the unit of the state, infinite where a side is unbounded.
     """
-    limits = limits_from(config.get("limits"))
+    limits = build_optional("limits", LIMITS, config.get("limits"))
     if limits is None:
         return {}
     bounds = limits.of_states(system)

@@ -16,15 +16,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dopt.control import Control, task_from
+from dopt.control import TASKS, Control
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, default_path, parameter
 from dopt.learning import LEARNERS, Learner
-from dopt.limits import Limits, limits_from
+from dopt.limits import LIMITS, Limits
 from dopt.models import MODELS, Model
 from dopt.models.base import MLP
 from dopt.policies import POLICIES, Policy
-from dopt.registry import TARGET, Part, build, check_stored
+from dopt.registry import TARGET, Part, build, build_optional, check_stored
 from dopt.spec.config import SECTIONS, TrialConfig, config_label, without_versions
 from dopt.systems import System, system_from_mapping
 
@@ -103,9 +103,10 @@ class TrialSpec(Validated):
         learner = build("learner", LEARNERS, sections["learner"])
         path = given.get("path")
         path = default_path((system, policy, model, learner)) if path is None else str(path)
-        optional = task_from(given.get("task")), limits_from(given.get("limits"))
+        task = build_optional("task", TASKS, given.get("task"))
+        limits = build_optional("limits", LIMITS, given.get("limits"))
         sampled = _assesses_samples(given.get("assess"))
-        config = TrialConfig(system, policy, model, learner, path, *optional, sampled)
+        config = TrialConfig(system, policy, model, learner, path, task, limits, sampled)
         return cls(config, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 
     @classmethod
@@ -127,7 +128,7 @@ class TrialSpec(Validated):
             Name of a registered class, with the defaults of its fields; or a section with the
             ``name`` and the fields that differ: ``env={"name": "pendulum", "gamma": 3.0}``.
         limits : mapping, optional
-            Bounds and rates (:meth:`dopt.limits.Limits.from_section`), such as
+            Bounds and rates (:class:`dopt.limits.Limits`), such as
             ``{"bounds": {"y": [-2, 2]}}``.
         seed : int
             Seed of the noise, the initial parameters and the policy's own draws.
