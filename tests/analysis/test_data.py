@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import analysis
-from analysis.data.matching import AnalysisError, Filter, defaults, nearness, newest
+from analysis.data.matching import AnalysisError, Filter, nearness, newest
 from analysis.data.samples import learned_model, simulated_trial
 from analysis.data.selection import is_possible, select
 from analysis.figures.phase_portraits import measure_portraits, measure_spectra, tabulate_portraits
@@ -22,6 +22,7 @@ from analysis.tables.comparisons import compare_policies
 from analysis.tables.rendering import TABLES
 from dopt.errors import SpecificationError
 from dopt.run import run_trial
+from dopt.spec.config import usual_values
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Curves, NoDatabaseError, Reader
 from orchestrate.store.schema import STEP_VALUES
@@ -285,7 +286,7 @@ def test_the_usual_value_stands_for_the_policy(stored: Reader) -> None:
     ]
     assert [entry.label for entry in entries] == ["D-optimal", "random"]
     old, new = sorted(stored.configs(), key=lambda one: "fresh" in one.label)[0::2]
-    assert defaults(old)[PATH] == "accumulated"
+    assert usual_values(old.config)[PATH] == "accumulated"
     assert nearness(old) > nearness(new)
 
 
