@@ -212,7 +212,7 @@ def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
                 "config_key": entry.config.config_key,
                 "n_registered": len(entry.trials),
                 "n_finished": len(entry.finished),
-                "n_diverged": sum(trial.status == "diverged" for trial in entry.trials),
+                "n_diverged": entry.n_diverged,
                 "n_missing": missing.get((entry.config.env, entry.config.policy), 0),
             }
             for entry in selection.entries

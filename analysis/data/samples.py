@@ -31,7 +31,6 @@ from analysis.data.matching import (
     read_condition,
 )
 from analysis.data.selection import Entry, environment_rank, policy_rank
-from analysis.style import of_finished
 from dopt.assessment import SAMPLE_LOSS, Plane
 from dopt.limits import LIMITS
 from dopt.registry import build_optional
@@ -50,30 +49,6 @@ from orchestrate.store.records import stacked
 from orchestrate.store.schema import STEP_VALUES
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Curves that enter a statistic: of the trials that did not diverge.
-
-    Attributes
-    ----------
-    seeds : (n,)
-    values : (n, T)
-        Finite.
-    n_finished : int
-        Trials that ran to an end, diverged ones included.
-    n_diverged : int
-    """
-
-    seeds: Integers
-    values: Array
-    n_finished: int
-    n_diverged: int
-
-    def describe(self) -> str:
-        """Return the count to print, such as ``98/100, 2 diverged``."""
-        return of_finished(len(self.values), self.n_finished, self.n_diverged)
-
-
 def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     """Return one column of the entry's finished trials.
 
@@ -87,11 +62,11 @@ def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     return Curves(curves.seeds[kept], curves.t[:n], curves.values[kept, :n], curves.diverged[kept])
 
 
-def read_sample(reader: Reader, entry: Entry, column: str) -> Sample:
+def read_sample(reader: Reader, entry: Entry, column: str) -> Curves:
     """Return the curves (n, T) that a statistic sees: a diverged trial leaves its whole curve."""
     curves = read_curves(reader, entry, column)
-    lost = curves.diverged
-    return Sample(curves.seeds[~lost], curves.values[~lost], len(lost), int(lost.sum()))
+    kept = ~curves.diverged
+    return Curves(curves.seeds[kept], curves.t, curves.values[kept], curves.diverged[kept])
 
 
 def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array]:

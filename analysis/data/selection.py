@@ -143,6 +143,15 @@ class Entry:
     def finished(self) -> tuple[TrialRow, ...]:
         return tuple(trial for trial in self.trials if trial.status in FINISHED)
 
+    @property
+    def n_diverged(self) -> int:
+        return sum(trial.status == "diverged" for trial in self.trials)
+
+    def describe(self, used: int) -> str:
+        """Return how many finished trials are in a statistic, such as ``98/100, 2 diverged``."""
+        lost = self.n_diverged
+        return f"{used}/{len(self.finished)}, {lost} diverged" if lost else str(used)
+
     def final_losses(self) -> dict[int, float]:
         """Return the final loss by seed of the trials that did not diverge."""
         return {

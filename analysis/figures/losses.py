@@ -65,7 +65,7 @@ from analysis.stats.curves import (
     measure_curves,
     tabulate_curves,
 )
-from analysis.stats.scores import final_losses, on_front
+from analysis.stats.scores import final_losses, on_front, values_of
 from analysis.style import (
     BLACK,
     GREY,
@@ -149,7 +149,7 @@ def _curves_panel(
         _lines(axes[0], curves, parts.upper, spread)
         _lines(axes[1], curves, parts.lower, spread)
         mark_break(*axes)
-    counts = {curve.label: curve.sample.describe() for curve in curves}
+    counts = {curve.label: curve.count for curve in curves}
     text = "; no ".join([count_text(counts), *map(policy_title, absent)])
     axes[0].set_title(_title(environment_title(curves[0].env), f"({text})"))
     return axes
@@ -235,7 +235,7 @@ def curves_caption(numbers: Curves) -> str:
     column, options, curves = numbers
     counts = [
         f"{environment_title(env)} "
-        + count_text({c.label: c.sample.describe() for c in curves if c.env == env})
+        + count_text({c.label: c.count for c in curves if c.env == env})
         for env in dict.fromkeys(c.env for c in curves)
     ]
     envs = dict.fromkeys(curve.env for curve in curves)
@@ -306,7 +306,7 @@ def measure_points(reader: Reader, selection: Selection) -> pd.DataFrame:
     rows = []
     for entry, learner in zip(selection.entries, learners, strict=True):
         scores = final_losses(reader, entry, "loss")
-        system, loss = system_of(entry.config.config), geometric_mean(scores.values)
+        system, loss = system_of(entry.config.config), geometric_mean(values_of(scores))
         row: dict[str, Any] = {
             "env": entry.config.env,
             "label": entry.label,
@@ -315,8 +315,8 @@ def measure_points(reader: Reader, selection: Selection) -> pd.DataFrame:
         row |= {"policy_label": policies[section_text(entry, "policy")], "learner_label": learner}
         row |= {"us_per_step": step_us(reader, entry)}
         row |= {"loss": loss.value, "low": loss.low, "high": loss.high, "unit": loss_unit(system)}
-        row |= {"n": len(scores.by_seed), "n_diverged": scores.n_diverged}
-        rows.append(row | {"counts": scores.describe(), "limit_us": 1e6 * system.dt})
+        row |= {"n": len(scores), "n_diverged": entry.n_diverged}
+        rows.append(row | {"counts": entry.describe(len(scores)), "limit_us": 1e6 * system.dt})
     table = pd.DataFrame(rows)
     costs = table[["us_per_step", "loss"]]
     front = np.zeros(len(table), dtype=bool)

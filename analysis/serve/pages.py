@@ -331,15 +331,11 @@ def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple
     column = params.choice("column", LOSSES, "loss")
     options = PlotOptions(params.member("x", Axis, Axis.STEPS))
 
-    def measured(part: Selection) -> LossCurve:
-        """Return a curve without the values of its trials, which the pages do not show."""
-        curve = measure_curves(reader, part, column, options)[0]
-        values = curve.sample.values[:, :0].copy()
-        return replace(curve, sample=replace(curve.sample, values=values))
-
     def cached(part: Selection) -> LossCurve:
         key = ("curve", reader, part.fingerprint(), column, options)
-        return state.cache.get_or_compute(key, lambda: measured(part))
+        return state.cache.get_or_compute(
+            key, lambda: measure_curves(reader, part, column, options)[0]
+        )
 
     parts = [replace(selection, entries=(entry,), gaps=()) for entry in selection.entries]
     return selection, tuple(cached(part) for part in parts)
@@ -351,7 +347,7 @@ def _curve(curve: LossCurve) -> Content:
     if curve.is_prequential:  # of one step it is noise
         running = pd.Series(band.centre).rolling(WINDOW, min_periods=1, center=True).median()
         values = {"values": running.to_numpy(), "points": band.centre}
-    return legend_entry(curve.policy) | values | {"count": curve.sample.describe()}
+    return legend_entry(curve.policy) | values | {"count": curve.count}
 
 
 def trials(state: ServerState, params: QueryParams) -> Content:

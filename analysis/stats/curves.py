@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.data.matching import setting_value
-from analysis.data.samples import Sample, read_sample
+from analysis.data.samples import read_sample
 from analysis.data.selection import Entry, Selection
 from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
 from dopt.assessment import TURN, Plane, turns, wrap
@@ -344,7 +344,8 @@ def log_limits(values: Array, margin: float = 1.15) -> tuple[float, float]:
 class LossCurve:
     """One entry in one environment: t in steps (T,), x on the axis (T,), band over trials.
 
-    ``unit`` is the loss's; where ``is_prequential``, the curve belongs to an exploration.
+    ``unit`` is the loss's, ``count`` the number of trials as a text; where ``is_prequential``, the
+    curve belongs to an exploration.
     """
 
     env: str
@@ -356,7 +357,8 @@ class LossCurve:
     unit: str
     band: Band
     statistic: Statistic
-    sample: Sample
+    count: str
+    n_diverged: int
     is_prequential: bool = False
 
 
@@ -406,7 +408,8 @@ def _curve(
         unit=loss_unit(system),
         band=band(sample.values, options.statistic),
         statistic=options.statistic,
-        sample=sample,
+        count=entry.describe(len(sample.values)),
+        n_diverged=entry.n_diverged,
         is_prequential=is_prequential(config.config),
     )
 
@@ -424,7 +427,7 @@ def tabulate_curves(curves: Iterable[LossCurve]) -> pd.DataFrame:
             "low": curve.band.low,
             "high": curve.band.high,
             "n": curve.band.n,
-            "n_diverged": curve.sample.n_diverged,
+            "n_diverged": curve.n_diverged,
         }
         for curve in curves
     ]

@@ -36,6 +36,7 @@ from analysis.data.selection import (
 )
 from analysis.stats.curves import mean, mean_columns
 from analysis.stats.scores import (
+    BySeed,
     benjamini_hochberg,
     censored_median,
     common_task,
@@ -56,7 +57,7 @@ from analysis.stats.scores import (
     without_ratio,
 )
 from analysis.style import but_diverged
-from analysis.tables.comparisons import BySeed, against_reference, loss_of_random_inputs, paired
+from analysis.tables.comparisons import against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
 from dopt.policies import policy_title
 from dopt.spec.trial import is_prequential, system_of
@@ -252,12 +253,12 @@ def _scores(reader: Reader, group: VariantGroup, epsilon: float) -> dict[str, di
     first = min((t for steps in tasks for t in steps if t > 0), default=0)
     return {
         one.label: {
-            "loss": final_losses(reader, one, "loss").by_seed,
-            "reachable_loss": final_losses(reader, one, "reachable_loss").by_seed,
-            "auc": mean_losses(reader, one, "loss").by_seed,
+            "loss": final_losses(reader, one, "loss"),
+            "reachable_loss": final_losses(reader, one, "reachable_loss"),
+            "auc": mean_losses(reader, one, "loss"),
             "coverage": coverages(reader, one, plane),
-            "control": scores_at(reader, one, first).by_seed if one.label in assessed else {},
-            "steps": steps_to(reader, one, "loss", epsilon, last_passage).by_seed,
+            "control": scores_at(reader, one, first) if one.label in assessed else {},
+            "steps": steps_to(reader, one, "loss", epsilon, last_passage),
         }
         for one in group.variants
     }
@@ -282,7 +283,7 @@ def _variant_row(
         "path": config.config["path"],
         "dt": config.config["env"]["dt"],
         "n": len(own["loss"]),
-        "n_diverged": sum(trial.status == "diverged" for trial in variant.finished),
+        "n_diverged": variant.n_diverged,
         "plan_us": _typical(reader, variant, "plan_us"),
         "learn_us": _typical(reader, variant, "learn_us"),
     }
