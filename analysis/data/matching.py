@@ -19,11 +19,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from dopt.errors import DoptError
 from dopt.registry import SOURCE, TARGET
-from dopt.spec.config import flatten, section_name, unusual
+from dopt.spec.config import difference, flatten, section_name, unusual
 from dopt.spec.trial import is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
 
@@ -239,26 +238,6 @@ def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:
 def _setting(config: ConfigRow) -> Setting:
     sections = (config.config.get(name) for name in ("env", "limits", "model", "learner"))
     return tuple(json.dumps(section, sort_keys=True) for section in sections)
-
-
-def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
-    """Return the first dotted path in which configurations differ, and its values.
-
-    One that all of them have goes before one that some lack.
-    """
-    flat = [flatten(config) for config in configs]
-    paths = differing_paths(flat)
-    if not paths:
-        return "config_key", [None for _ in configs]
-    path = min(paths, key=lambda one: (not all(one in entry for entry in flat), one))
-    return path, [entry.get(path) for entry in flat]
-
-
-def differing_paths(flat: Sequence[Mapping[str, Any]]) -> set[str]:
-    """Return the dotted paths in which some flat configurations differ."""
-    first = flat[0]
-    paths = set().union(*flat)
-    return {path for path in paths if any(own.get(path) != first.get(path) for own in flat)}
 
 
 def accepted(reader: Reader, wanted: Filter) -> list[ConfigRow]:

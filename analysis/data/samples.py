@@ -12,7 +12,6 @@ results.model(trial).predict(states)   # learned accelerations (N, r) of a row o
 
 from __future__ import annotations
 
-import json
 import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -28,10 +27,10 @@ from analysis.data.matching import (
     accepted,
     choose,
     latest_sources,
-    read_condition,
 )
 from analysis.data.selection import Entry, environment_rank, policy_rank
 from dopt.assessment import SAMPLE_LOSS, Plane
+from dopt.evaluation import rates
 from dopt.limits import LIMITS
 from dopt.registry import build_optional
 from dopt.spec.scaled import learned_accelerations
@@ -135,16 +134,10 @@ class LearnedModel:
         """
         values = learned_accelerations(self.spec, self.parameters, states, inputs)
         if inputs is not None:
-            x, u = np.atleast_2d(states), np.atleast_2d(inputs)
-            values = self._derivative(x, u, values)
+            x, u = np.atleast_2d(np.asarray(states, float)), np.atleast_2d(inputs)
+            accelerations = values
+            values = rates(self.spec.system, lambda *_: accelerations, u, x)
         return values[0] if np.ndim(states) == 1 else values
-
-    def _derivative(self, x: Array, u: Array, accelerations: Array) -> Array:
-        system = self.spec.system
-        known = system.known(tuple(x.T), tuple(u.T), system.parameters)
-        flow = np.stack([np.broadcast_to(row, len(x)) for row in known], axis=-1).astype(float)
-        flow[:, list(system.learned_rows)] += accelerations
-        return flow
 
 
 def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
@@ -173,8 +166,8 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
 def read_request(env: object, policy: object, where: object) -> Filter:
     """Return the filter of a request; raise AnalysisError for arguments of another kind."""
     return Filter(
-        _names("env", env, "pendulum", "cartpole"),
-        _names("policy", policy, "random", "d_optimal"),
+        _names("env", env, "pendulum"),
+        _names("policy", policy, "random"),
         {} if where is None else _conditions(where),
     )
 
@@ -194,29 +187,24 @@ def trial_key(trial: object) -> str:
     )
 
 
-def _names(what: str, given: object, *example: str) -> tuple[str, ...]:
+def _names(what: str, given: object, example: str) -> tuple[str, ...]:
     if isinstance(given, str):
         return (given,)
     names = tuple(given) if isinstance(given, Iterable) else (given,)
-    known = tuple(name for name in names if isinstance(name, str))
-    if len(known) < len(names):
-        one, two = map(json.dumps, example)
-        raise AnalysisError(
-            f"{what} is {_short(given)}, but a name or a list of names is expected: "
-            f"write for instance {what}={one} or {what}=[{one}, {two}]."
-        )
-    return known
+    if all(isinstance(name, str) for name in names):
+        return names
+    raise AnalysisError(
+        f"{what} is {_short(given)}, but a name or a list of names is expected: write for "
+        f'instance {what}="{example}".'
+    )
 
 
 def _conditions(given: object) -> Mapping[str, object]:
     if isinstance(given, Mapping) and all(isinstance(path, str) for path in given):
         return given
-    texts = given if isinstance(given, list) else [given]
-    read = [read_condition(text) for text in texts if isinstance(text, str)]
-    meant = dict(condition for condition in read if condition) or {"model.width": 32}
     raise AnalysisError(
         f"where is {_short(given)}, but a mapping of dotted paths to values is expected: "
-        f"write for instance where={meant!r}."
+        f"write for instance where={{'model.width': 32}}."
     )
 
 

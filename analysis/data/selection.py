@@ -22,13 +22,10 @@ from analysis.data.matching import (
 )
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES, TITLES
-from dopt.spec.config import labels, limits_label, value_label
+from dopt.spec.config import SECTIONS, labels, limits_label, value_label
 from dopt.spec.trial import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS
 from orchestrate.store import FINISHED, ConfigRow, Reader, TrialRow
-
-Compatible = Callable[[ConfigRow, ConfigRow], bool]
-_SECTIONS = ("env", "policy", "model", "learner")
 
 ENVIRONMENTS = (
     *("pendulum", "cartpole", "arm", "quadrotor"),
@@ -70,13 +67,11 @@ def ranges(seeds: Iterable[int]) -> str:
 
 def is_possible(policy: ConfigRow, environment: ConfigRow) -> bool:
     """Return True if a policy's configuration makes sense with another environment's section."""
-    config = {key: value for key, value in policy.config.items() if key in _SECTIONS}
+    config = {key: value for key, value in policy.config.items() if key in SECTIONS}
     try:
         stored_trial({**config, "env": environment.config["env"]})
-    except IncompatibleError:
-        return False
-    except SpecificationError:
-        return True
+    except SpecificationError as error:
+        return not isinstance(error, IncompatibleError)
     return True
 
 
@@ -91,9 +86,7 @@ def why_impossible(env: str, policy: str) -> str | None:
     return None
 
 
-def absent_pairs(
-    configs: Sequence[ConfigRow], compatible: Compatible = is_possible
-) -> list[tuple[str, str]]:
+def absent_pairs(configs: Sequence[ConfigRow]) -> list[tuple[str, str]]:
     """Return the (environment, policy) pairs of which nothing is stored though they make sense.
 
     Nothing is expected of explorations.
@@ -106,7 +99,7 @@ def absent_pairs(
         (env, policy)
         for env in environments
         for policy in policies
-        if (env, policy) not in stored and compatible(policies[policy], environments[env])
+        if (env, policy) not in stored and is_possible(policies[policy], environments[env])
     ]
 
 
@@ -253,7 +246,7 @@ def environment_rank(environment: str) -> tuple[int, str]:
     return (ENVIRONMENTS.index(environment) if known else len(ENVIRONMENTS), environment)
 
 
-def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible) -> Selection:
+def select(reader: Reader, wanted: Filter) -> Selection:
     """Return the trials that stand for each environment and policy.
 
     Raises
@@ -276,7 +269,7 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     )
     return Selection(
         entries,
-        tuple(_gaps(entries, compatible if by_policy else None)),
+        tuple(_gaps(entries, by_policy=by_policy)),
         (*omissions(stored, chosen), *source_notes(current, chosen)),
         tuple(labelled(Entry(config, trials[config.config_key]) for config in stored)),
         wanted.reference,
@@ -325,8 +318,8 @@ def _group_rank(entry: Entry, group_by: Sequence[str]) -> list[tuple[float, int,
     return ranks
 
 
-def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable[Gap]:
-    """Yield what entries lack; policies without any trial where it is known which are possible."""
+def _gaps(entries: tuple[Entry, ...], *, by_policy: bool) -> Iterable[Gap]:
+    """Yield what entries lack, with ``by_policy`` also possible policies without any trial."""
     seeds: dict[str, set[int]] = {}
     for entry in entries:
         seeds.setdefault(entry.config.env, set()).update(trial.seed for trial in entry.trials)
@@ -340,9 +333,7 @@ def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable
             states = Counter(state.get(seed, "not registered") for seed in missing)
             text = ", ".join(f"{count} {name}" for name, count in sorted(states.items()))
             yield Gap(entry.config.env, entry.config.policy, tuple(sorted(missing)), text)
-    if compatible is None:
-        return
-    for env, policy in absent_pairs([entry.config for entry in entries], compatible):
+    for env, policy in absent_pairs([entry.config for entry in entries]) if by_policy else ():
         expected = seeds[env]
         yield Gap(env, policy, tuple(sorted(expected)), f"{len(expected)} not registered")
 

@@ -224,7 +224,7 @@ def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> lis
     handles: list[Artist] = [
         Line2D([], [], label=label, **look(style)) for label, style in styles.items()
     ]
-    name = options.interval
+    name = options.statistic.band
     if options.spread is Spread.BAND:
         return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=name)]
     return [*handles, Line2D([], [], ls="none", marker="|", ms=9, mew=1, color=GREY, label=name)]
@@ -243,7 +243,7 @@ def curves_caption(numbers: Curves) -> str:
     return (
         f"{_what(column, curves)} against time t, one panel per environment. "
         f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
-        f"{options.interval}; no smoothing. {_breaks(curves)}"
+        f"{options.statistic.band}; no smoothing. {_breaks(curves)}"
         f"A diverged trial leaves its whole curve. Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )

@@ -276,11 +276,6 @@ class PlotOptions:
     spread: Spread = Spread.BAND
     epsilon: float | None = None
 
-    @property
-    def interval(self) -> str:
-        """Return the name of the intervals of the loss curves."""
-        return self.statistic.band
-
     def as_dict(self) -> dict[str, str]:
         return {key: str(value) for key, value in asdict(self).items()}
 

@@ -254,17 +254,13 @@ def _reference(table: pd.DataFrame) -> str:
     return f"reference (same {keys}{', if stored' if '' in set(table['same']) else ''})"
 
 
-def gaps_table(gaps: Iterable[Gap]) -> TextTable:
-    """Return the table of what is missing."""
-    rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
-    return TextTable(["env", "policy", "missing", "state", "seeds"], rows)
-
-
 def incomplete(gaps: Sequence[Gap], wanted: str, options: str) -> IncompleteError:
     """Return the error for trials that are missing; ``options`` narrow the request."""
     missing = sum(len(gap.seeds) for gap in gaps)
+    rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
+    table = TextTable(["env", "policy", "missing", "state", "seeds"], rows)
     return IncompleteError(
-        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, {wanted} "
+        f"{table.markdown()}\n\nerror: {missing} trials are missing, {wanted} "
         f"expected: run the launch again, narrow the request by {options}, "
         f"or give --allow-partial to go on with what there is."
     )

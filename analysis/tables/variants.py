@@ -20,7 +20,6 @@ from analysis.data.matching import (
     AnalysisError,
     Filter,
     accepted,
-    difference,
     latest_sources,
     nearness,
 )
@@ -60,6 +59,7 @@ from analysis.style import but_diverged
 from analysis.tables.comparisons import against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
 from dopt.policies import policy_title
+from dopt.spec.config import difference
 from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Assessments, Reader
 

@@ -22,11 +22,11 @@ from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside, first_evidence, first_simulation
 from dopt.explorer.saving import Explored
-from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
+from dopt.explorer.state import PunctualPlanner, may_remember_plans
 from dopt.learning import Conditioning, GaussNewton, Learner, SimulationError
 from dopt.models import Model
 from dopt.policies import Policy
-from dopt.spec.config import LARGEST_HORIZON, completed
+from dopt.spec.config import LARGEST_HORIZON, completed, difference
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
@@ -484,10 +484,10 @@ class Explorer(Explored):
             return
         stored, given = completed(journal.events[0]["trial"]), completed(self.spec.to_mapping())
         if stored != given:
+            path, (then, now) = difference([stored, given])
             raise SpecificationError(
-                f"the journal {journal.path} belongs to another exploration "
-                f"({difference(stored, given)}): give the same arguments as then, or "
-                f"another file."
+                f"the journal {journal.path} belongs to another exploration ({path} was {then!r} "
+                f"and is {now!r}): give the same arguments as then, or another file."
             )
         for number, event in enumerate(journal.events[1:], start=2):
             if not self._state.may_replay(event):

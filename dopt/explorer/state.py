@@ -38,7 +38,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -549,12 +549,3 @@ def _steps_of(spec: TrialSpec) -> Steps:
     from dopt.kernel.run import KernelSteps
 
     return KernelSteps(spec)
-
-
-def difference(stored: Any, given: Any, path: str = "") -> str:
-    """Say where two specifications differ first."""
-    if isinstance(stored, dict) and isinstance(given, dict):
-        for key in sorted({*stored, *given}, key=lambda key: (key != "name", key)):
-            if stored.get(key) != given.get(key):
-                return difference(stored.get(key), given.get(key), f"{path}.{key}".lstrip("."))
-    return f"{path} was {stored!r} and is {given!r}"

@@ -481,6 +481,20 @@ def flatten(config: Mapping[str, object], prefix: str = "") -> dict[str, object]
     return flat
 
 
+def difference(configs: Sequence[Mapping[str, object]]) -> tuple[str, list[object]]:
+    """Return the first dotted path in which configurations differ, and its values.
+
+    One that all of them have goes before one that some lack.
+    """
+    flat = [flatten(config) for config in configs]
+    known = set().union(*flat)
+    paths = [path for path in known if any(one.get(path) != flat[0].get(path) for one in flat)]
+    if not paths:
+        return "config_key", [None for _ in configs]
+    path = min(paths, key=lambda one: (not all(one in entry for entry in flat), one))
+    return path, [entry.get(path) for entry in flat]
+
+
 def _defaults(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:
     """Return the section of a class with nothing set; of a task, as the system resolves it."""
     if (cls, env) not in _known:

@@ -131,11 +131,11 @@ def test_a_model_of_no_trial_or_of_wrong_states_is_a_sentence(results: analysis.
 @pytest.mark.parametrize(
     ("request_", "sentence"),
     [
-        ({"where": "model.width=16"}, r"^where is 'model.width=16', .*where=\{'model.width': 16\}"),
-        ({"where": ["model.width=16"]}, r"^where is \['model.width=16'\], .*'model.width': 16\}"),
+        ({"where": "model.width=16"}, r"^where is 'model.width=16', .*where=\{'model.width': 32\}"),
+        ({"where": ["model.width=16"]}, r"^where is \['model.width=16'\], .*'model.width': 32\}"),
         ({"where": {3: 4}}, r"^where is \{3: 4\}, but a mapping of dotted paths"),
         ({"where": {"model.width": np.int64(5)}}, r"model.width=\S+ fits no stored"),
-        ({"env": 3}, r"^env is 3, but a name or a list of names is expected: write .*\]\.$"),
+        ({"env": 3}, r"^env is 3, but a name or a list of names is expected: write .*\.$"),
         ({"policy": ["random", None]}, r"^policy is \['random', None\], but a name"),
         ({"env": ["pendulum", "motr"]}, r"no trial of environment 'motr', choose one of cartpole"),
         ({"policy": "greedy"}, r"no trial of policy 'greedy', choose one of d_optimal"),
