@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dopt.arguments import instance, within
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, parameter, unvalidated
 from dopt.systems.base import System
@@ -65,11 +66,13 @@ class Limits(Validated):
     def __post_init__(self) -> None:
         super().__post_init__()
         bounds = ((name, *_interval(name, pair)) for name, pair in _named("bounds", self.bounds))
-        rates = ((name, _rate(name, rate)) for name, rate in _named("rates", self.rates))
+        rates = (
+            (name, within(f"limits.rates.{name}", rate, math.inf))
+            for name, rate in _named("rates", self.rates)
+        )
         object.__setattr__(self, "bounds", tuple(bounds))
         object.__setattr__(self, "rates", tuple(rates))
-        if not isinstance(self.enforced, bool):
-            raise _unlike("enforced", self.enforced, "true or false")
+        instance("limits.enforced", self.enforced, bool, "true or false")
 
     def to_section(self) -> dict[str, object]:
         """Return the section that describes these limits in a configuration."""
@@ -157,13 +160,6 @@ def _interval(name: str, given: object) -> Interval:
         expected = "a pair of numbers, the lower one first, or null for none"
         raise _unlike(f"bounds.{name}", pair or given, expected)
     return found[0], found[1]
-
-
-def _rate(name: str, given: object) -> float:
-    rate = _number(given)
-    if not 0.0 < rate < math.inf:
-        raise _unlike(f"rates.{name}", given, "a positive number")
-    return rate
 
 
 def _number(given: object) -> float:

@@ -13,7 +13,7 @@ from dopt.errors import ScaleWarning, SpecificationError, suggestion
 from dopt.learning import Learner
 from dopt.models import MLP, Model
 from dopt.policies import Policy
-from dopt.systems.base import KINDS, Array, Feature, System
+from dopt.systems.base import KINDS, Array, System
 from dopt.systems.black_box import BlackBox
 from dopt.systems.properties import input_effect
 
@@ -307,15 +307,10 @@ def _moved(system: System, point: Any, step: complex) -> Any:
 def _check_indices(system: System) -> None:
     d, name = system.n_states, system.name
     for feature in system.features:
-        if not isinstance(feature, Feature):
+        if getattr(feature, "kind", None) not in KINDS:
             raise SpecificationError(
-                f"features of env '{name}' hold {feature!r}, but entries like "
-                f"Feature('cos', 0) are expected: make it a dopt.systems.Feature."
-            )
-        if feature.kind not in KINDS:
-            raise SpecificationError(
-                f"features of env '{name}' hold one of kind '{feature.kind}', but the kinds are "
-                f"{', '.join(KINDS)}: take one of them."
+                f"features of env '{name}' hold {feature!r}, but entries like Feature('cos', 0) of "
+                f"the kinds {', '.join(KINDS)} are expected: make it one of these."
             )
     declared = {
         "learned_rows": system.learned_rows,
@@ -355,16 +350,11 @@ def _try(system: System, what: str, size: int, *arguments: Sequence[Any]) -> Non
             f"dopt.systems.elementary are expected in it, which serve numbers, arrays and tensors "
             f"alike: write it with these."
         ) from error
-    if single:
+    if single or len(found) != size:
+        returned = "one number" if single else f"{len(found)} numbers"
         raise SpecificationError(
-            f"{what}() of env '{system.name}' returns one number, but a tuple of {size} is "
-            f"expected, one for each {entry}: return {'a,' if size == 1 else 'a, b, ...'} "
-            f"with its comma{'' if size == 1 else 's'}."
-        )
-    if len(found) != size:
-        raise SpecificationError(
-            f"{what}() of env '{system.name}' returns {len(found)} numbers, but {size} are "
-            f"expected, one for each {entry}: correct it."
+            f"{what}() of env '{system.name}' returns {returned}, but a tuple of {size} is "
+            f"expected, one for each {entry}: correct it; a tuple of one is written with its comma."
         )
 
 

@@ -14,8 +14,7 @@ import json
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
-
+from dopt.arguments import instance, whole
 from dopt.control import TASKS, Control
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, default_path, parameter
@@ -48,16 +47,7 @@ class TrialSpec(Validated):
     seed: int = parameter(0, bound="nonnegative")
 
     def __post_init__(self) -> None:
-        given: object = self.seed
-        if isinstance(given, np.integer):
-            object.__setattr__(self, "seed", int(given))
-        whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
-        if not whole or not 0 <= self.seed <= LARGEST_SEED:
-            shown = "null" if given is None else repr(self.seed)
-            raise SpecificationError(
-                f"seed is {shown}, but a whole number of 0 or above and below 2^63 is "
-                f"expected: set seed to a whole number in this range."
-            )
+        object.__setattr__(self, "seed", whole("seed", self.seed, 0, LARGEST_SEED))
 
     @classmethod
     def from_mapping(cls, given: Mapping[str, object]) -> TrialSpec:
@@ -173,7 +163,8 @@ class TrialSpec(Validated):
         }
         rest: dict[str, object] = {"seed": seed, "limits": limits}
         rest |= {"path": path} if path else {}
-        _check_system(system)
+        expected = "an object such as SYSTEMS['pendulum'](), and for a name TrialSpec.from_names,"
+        instance("the system of TrialSpec.of_system", system, System, expected)
         return cls._of_parts(system, parts, rest)
 
     def with_seed(self, seed: int) -> TrialSpec:
@@ -271,20 +262,6 @@ def _assesses_samples(section: object) -> bool:
     raise SpecificationError(
         f"configuration key 'assess' is {section!r}, but a section with sample_loss, true or "
         f"false, is expected: write for instance assess.sample_loss=true."
-    )
-
-
-def _check_system(system: object) -> None:
-    """Refuse what is no system, such as a class of systems or a name."""
-    if isinstance(system, System):
-        return
-    if isinstance(system, type) and issubclass(system, System):
-        given, remedy = f"the class {system.__name__}", f"give an object of it, {system.__name__}()"
-    else:
-        given, remedy = repr(system), "use TrialSpec.from_names for a name or a section"
-    raise SpecificationError(
-        f"the system of TrialSpec.of_system is {given}, but an object of a class derived from "
-        f"dopt.systems.System is expected: {remedy}."
     )
 
 

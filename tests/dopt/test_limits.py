@@ -153,7 +153,7 @@ WRONG = [
     ({"bounds": {"u": [1, 2]}}, r"limits\.bounds\.u is .* but an interval with 0 in it"),
     ({"bounds": [2.0]}, r"limits\.bounds is \[2\.0\], but a mapping of names"),
     ({"rates": {"y": 1.0}}, "input in limits.rates 'y' is unknown"),
-    ({"rates": {"u": 0.0}}, r"limits\.rates\.u is 0\.0, but a positive number"),
+    ({"rates": {"u": 0.0}}, r"limits\.rates\.u is 0\.0, but a number above 0"),
     ({"rates": {"u": True}}, r"limits\.rates\.u is True"),
     (RAIL | {"steps": 0}, r"limits\.steps is 0 steps, but it has to be"),
     (RAIL | {"margin": -1.0}, r"limits\.margin is -1\.0"),
@@ -162,7 +162,7 @@ WRONG = [
     ({"bounds": {"y": [None, None]}}, "limits have neither a bound nor a rate"),
     ({"bounds": 0}, r"limits\.bounds is 0, but a mapping of names"),
     ({"bounds": {"y": [-(10**400), 1]}}, r"limits\.bounds\.y is .* but a pair"),
-    ({"rates": {"u": 10**400}}, r"limits\.rates\.u is .* but a positive number"),
+    ({"rates": {"u": 10**400}}, r"limits\.rates\.u is .* but a number above 0"),
     ("rail", "configuration key 'limits' is 'rail', but a section"),
     ({"name": "sphere"}, "limits 'sphere' is unknown"),
 ]
