@@ -397,7 +397,7 @@ CASES: list[tuple[Callable[..., Any], tuple[Any, ...], str]] = [
     (
         TrialSpec.of_system,
         ("pendulum", "random"),
-        r"is 'pendulum', .* for a name TrialSpec\.from_names",
+        r"is 'pendulum', .* TrialSpec\.from_names,",
     ),
     (TrialSpec.of_system, (Pendulum(), None), r"configuration key 'policy' is None, but a section"),
     (run_trial, ("pendulum",), r"run_trial was given 'pendulum', but a TrialSpec is expected"),
