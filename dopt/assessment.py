@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -232,25 +232,22 @@ def assess(
             goal, noise = task.on(spec.system), _control_noise(spec.system, task, spec.seed)
             truth = true_forecast(spec.system)
             episode = run_feedback(spec.system, goal, truth, feedbacks[t], noise)
-            rows += _measured(t, "feedback", Outcome(episode.success, episode.cost))
+            rows += _measured(t, "feedback", (episode.success, episode.cost))
         error = free_run_error(spec.system, forecast, task.free_run_steps)
         rows.append(Assessment(t, "free_run_error", error))
         rows.append(Assessment(t, "coverage", plane.coverage(states[: t + 1])))
     return tuple(rows)
 
 
-class Outcome(NamedTuple):
-    """Success and cost of an episode."""
-
-    success: bool
-    cost: float
+Outcome = tuple[bool, float]
+"""Success and cost of an episode."""
 
 
 def _controlled(system: System, task: Control, seed: int, forecast: Forecast) -> Outcome:
     """Run an episode; all of a seed share the noise and the planner's draws."""
     noise, plans = _control_noise(system, task, seed), stream(seed, "control_plans")
     episode = run_episode(system, task, true_forecast(system), forecast, noise, plans)
-    return Outcome(episode.success, episode.cost)
+    return episode.success, episode.cost
 
 
 def _control_noise(system: System, task: Control, seed: int) -> Array:
@@ -277,8 +274,9 @@ def _initial(system: System, model: Model, seed: int) -> Array:
 
 
 def _measured(t: int, name: str, outcome: Outcome) -> Iterator[Assessment]:
-    yield Assessment(t, f"{name}_success", float(outcome.success))
-    yield Assessment(t, f"{name}_cost", outcome.cost)
+    success, cost = outcome
+    yield Assessment(t, f"{name}_success", float(success))
+    yield Assessment(t, f"{name}_cost", cost)
 
 
 def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dopt.errors import IncompatibleError
 from dopt.fields import parameter
-from dopt.policies.base import Array, ClosedLoop, CustomPolicy, InformationPolicy, Planner
+from dopt.policies.base import Array, CustomPolicy, InformationPolicy, Planner, Policy
 from dopt.policies.search import CandidatePolicy
 from dopt.sphere import sphere_maximizer
 from dopt.systems.base import System
@@ -326,7 +326,7 @@ def is_linear(system: System) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Uniform(ClosedLoop):
+class Uniform(Policy):
     """Maximise G(u) = Σ_{s≤t} ‖x(u) - x_s‖₂ on the sphere ‖u‖ = γ (section 3).
 
     The prediction x(u) = x_t + dt f_θ(x_t, u) is affine in u, so G is convex and its maximum over

@@ -19,7 +19,6 @@ from dopt.learning import Adam, AdamWindow
 from dopt.models import MLP
 from dopt.policies.base import (
     Array,
-    ClosedLoop,
     CustomPolicy,
     Planner,
     check_ensemble,
@@ -31,7 +30,7 @@ from dopt.trial_view import TrialView
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldCandidates(CandidatePolicy, ClosedLoop):
+class HeldCandidates(CandidatePolicy):
     """Predict where each of some inputs leads if it is held, and apply the best of them.
 
     Parameters
