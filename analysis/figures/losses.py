@@ -373,11 +373,6 @@ def policies_of(points: pd.DataFrame) -> dict[str, str]:
     return dict(sorted(found.items(), key=lambda one: (policy_rank(one[1]), len(one[0]), one[0])))
 
 
-def tabulate_points(points: pd.DataFrame) -> pd.DataFrame:
-    """Return what is drawn, one row for each environment and configuration."""
-    return points.drop(columns=["unit", "counts", "limit_us", "known"])
-
-
 def draw(points: pd.DataFrame) -> Figure:
     """Draw a panel for each environment, with a legend of policies and learners below all."""
     parts = [part for _, part in points.groupby("env", sort=False)]
@@ -506,7 +501,7 @@ PARETO: Plot[pd.DataFrame] = Plot(
     band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
     part=lambda selection, _: pareto_part(selection),
     measure=lambda reader, selection, _: measure_points(reader, selection),
-    tabulate=tabulate_points,
+    tabulate=lambda points: points.drop(columns=["unit", "counts", "limit_us", "known"]),
     draw=draw,
     caption=caption,
 )

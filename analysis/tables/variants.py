@@ -164,7 +164,8 @@ def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | No
     references = [entry for entry in kept if entry.config.policy == policy]
     if not references or len(kept) < 2:
         return None
-    reference = max(references, key=lambda entry: (_company(entry, kept), *nearness(entry.config)))
+    company = Counter(map(_setting, kept))
+    reference = max(references, key=lambda one: (company[_setting(one)], *nearness(one.config)))
     words = labels_of(entry.config for entry in kept)
     variants = [replace(entry, label=label) for entry, label in zip(kept, words, strict=True)]
     first = next(one for one in variants if one.config is reference.config)
@@ -201,14 +202,8 @@ def _of_other_tasks(variants: Sequence[Entry], task: str | None) -> Iterator[str
         )
 
 
-def _company(entry: Entry, entries: Sequence[Entry]) -> int:
-    """Return how many entries share the model, the learner and the limits of this one."""
-    own = _setting(entry)
-    return sum(_setting(one) == own for one in entries)
-
-
-def _setting(entry: Entry) -> list[str]:
-    return [section_text(entry, name) for name in _SETTING]
+def _setting(entry: Entry) -> tuple[str, ...]:
+    return tuple(section_text(entry, name) for name in _SETTING)
 
 
 def tabulate_group(reader: Reader, group: VariantGroup) -> pd.DataFrame:

@@ -34,8 +34,8 @@ from torch.nn.utils import parameters_to_vector
 from dopt.algorithm import TIE_MARGIN
 from dopt.errors import SpecificationError
 from dopt.models import MLP, Linear, Model
+from dopt.policies.d_optimal import best_on_sphere
 from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
-from dopt.sphere import sphere_maximizer
 from dopt.systems.base import System, feature_values, next_state
 from dopt.systems.properties import STEP
 from dopt.types import Array, Scalar
@@ -556,7 +556,7 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     Q, v = problem
     if len(v) == 1:
         Q_0, v_0, tie = (one[0].numpy(force=True) for one in (Q, v, ties))
-        return v.new_tensor(_input_of_one(Q_0, v_0, tie, gamma))[None]
+        return v.new_tensor(best_on_sphere(Q_0, v_0, tie, gamma))[None]
     finite = torch.cat([Q, v.unsqueeze(-1)], dim=-1).isfinite().all(-1).all(-1, keepdim=True)
     if v.shape[1] == 1:
         up = (v < 0) | ((v == 0) & (ties > 0))
@@ -565,16 +565,6 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
         Q, v = torch.where(finite.unsqueeze(-1), Q, 0.0), torch.where(finite, v, 0.0)
         chosen = maximize_on_spheres(Q, v, gamma, ties)
     return torch.where(finite, chosen, torch.nan)
-
-
-def _input_of_one(Q: Array, v: Array, tie: Array, gamma: float) -> Array:
-    """Return the maximiser, (m,), of one trial, in numpy."""
-    if not (np.isfinite(Q).all() and np.isfinite(v).all()):
-        return np.full_like(v, np.nan)
-    if len(v) == 1:
-        up = v[0] < 0 or (v[0] == 0 and tie[0] > 0)
-        return np.array([gamma if up else -gamma])
-    return sphere_maximizer(Q, v, gamma, tie)
 
 
 def uniform_inputs(

@@ -209,6 +209,13 @@ class TrialConfig:
                 f"path is 'kernel', but {foreign[0].section} '{foreign[0].name}' is not written "
                 f"for it: set path to 'reference', or leave it out."
             )
+        for part in (self.policy, self.learner):
+            if isinstance(part, (CustomPolicy, CustomLearner)) and not part.compiled:
+                raise SpecificationError(
+                    f"{part.section} '{part.name}' declares compiled = False, as one that is "
+                    f"written in torch did, but numpy is expected: leave that line out and write "
+                    f"it in numpy, or derive it from Compiled{part.section.capitalize()}."
+                )
         if self.path == "reference":
             check_reference(self._parts, enforced=bool(self.limits and self.limits.enforced))
 
