@@ -92,11 +92,7 @@ class Filter:
             found = {json.dumps(entry[path]): entry[path] for entry in flat if path in entry}
             stored = sorted(found, key=lambda text: (_size(found[text]), text))
             if not stored:
-                near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
-                raise AnalysisError(
-                    f"--where {path} names no value of a stored configuration: "
-                    f"choose for instance one of {', '.join(near) or 'model.width, env.gamma'}."
-                )
+                raise _no_setting(f"--where {path} names no value", path, flat)
             if not any(entry.get(path) == value for entry in flat if path in entry):
                 text = json.dumps(value, default=str)
                 raise AnalysisError(
@@ -156,13 +152,17 @@ def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
     """Raise AnalysisError for a setting that no configuration has."""
     for key in keys:
         if all(setting_value(config, key) is None for config in configs):
-            known = {*COLUMNS}.union(*(flatten(config.config) for config in configs))
-            near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)
-            raise AnalysisError(
-                f"'{key}' is no setting of a stored configuration, but a column or a dotted path "
-                f"is expected: choose for instance one of "
-                f"{', '.join(near) or 'policy, learner, width, env.gamma'}."
-            )
+            flat = [flatten(config.config) for config in configs]
+            raise _no_setting(f"'{key}' is no setting", key, [*flat, dict.fromkeys(COLUMNS)])
+
+
+def _no_setting(said: str, path: str, flat: Sequence[Mapping[str, object]]) -> AnalysisError:
+    """Return the error for a path that no flat configuration has, with the nearest that some do."""
+    near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
+    return AnalysisError(
+        f"{said} of a stored configuration: choose for instance one of "
+        f"{', '.join(near) or 'model.width, env.gamma'}."
+    )
 
 
 def _choose_policies(group: Sequence[ConfigRow], reference: str) -> list[ConfigRow]:

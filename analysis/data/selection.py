@@ -181,15 +181,15 @@ class Selection:
         """Return the part about some environments and policies; no policies means all."""
         envs, names = set(environments), set(policies)
 
-        def kept(env: str, policy: str) -> bool:
-            return env in envs and (not names or policy in names)
+        def kept(one: ConfigRow | Gap) -> bool:
+            return one.env in envs and (not names or one.policy in names)
 
-        return replace(
-            self,
-            entries=tuple(e for e in self.entries if kept(e.config.env, e.config.policy)),
-            gaps=tuple(gap for gap in self.gaps if kept(gap.env, gap.policy)),
-            stored=tuple(e for e in self.stored if kept(e.config.env, e.config.policy)),
-        )
+        gaps = tuple(gap for gap in self.gaps if kept(gap))
+        return replace(self._where(lambda one: kept(one.config)), gaps=gaps)
+
+    def _where(self, kept: Callable[[Entry], bool]) -> Selection:
+        entries, stored = tuple(filter(kept, self.entries)), tuple(filter(kept, self.stored))
+        return replace(self, entries=entries, stored=stored)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -216,11 +216,7 @@ class Selection:
 
     def simulated(self) -> Selection:
         """Return the part without explorations, whose losses are errors along their own paths."""
-        entries, stored = (
-            tuple(one for one in part if not is_prequential(one.config.config))
-            for part in (self.entries, self.stored)
-        )
-        return replace(self, entries=entries, stored=stored)
+        return self._where(lambda one: not is_prequential(one.config.config))
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the selected trials, their outcome and what is missing."""

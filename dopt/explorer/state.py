@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import logging
 import math
 from collections import Counter
@@ -43,6 +44,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dopt.errors import ExplorationError
+from dopt.evaluation import rates
 from dopt.explorer.journal import Event, is_event
 from dopt.explorer.refit import Found, Recording
 from dopt.explorer.signs import Signs
@@ -506,16 +508,11 @@ class ExplorerState:
         if self.spec.system.n_measured or (units == units[0]).all():
             return None
         x, following = self.steps.states[t : t + 2]
-        u, system, parameters = self.steps.inputs[t], self._scaled.system, self.steps.parameters
-
-        def rate(x: Array) -> Array:
-            known = system.known(tuple(x), tuple(u), system.parameters)
-            flow = np.array(known, dtype=float)
-            flow[self._rows] += self.spec.model.predict(system, parameters, x[None], u[None])[0]
-            return flow
-
+        u, system = self.steps.inputs[t], self._scaled.system
+        predict = functools.partial(self.spec.model.predict, system, self.steps.parameters)
+        rate = functools.partial(rates, system, predict, u[None])
         with np.errstate(all="ignore"):
-            missed = following - next_state(system.integrator, rate, x, dt)
+            missed = following - next_state(system.integrator, rate, x[None], dt)[0]
         return float(np.linalg.norm(units * missed[self._rows] / dt))
 
     def _watch_size(self, t: int, following: Array, u: Array, dt: float) -> None:
