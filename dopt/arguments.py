@@ -1,4 +1,4 @@
-"""Checks of the arguments of explorers and fits."""
+"""Checks of arguments: kinds, whole and real numbers, and rows of them."""
 
 from __future__ import annotations
 

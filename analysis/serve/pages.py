@@ -16,7 +16,7 @@ import pandas as pd
 from analysis.data.matching import AnalysisError, latest
 from analysis.data.samples import bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
-from analysis.serve.web import NotFoundError, QueryParams, ServerState, read_progress, truncated
+from analysis.serve.web import QueryParams, RequestError, ServerState, read_progress, truncated
 from analysis.stats.curves import (
     Axis,
     DrawnPlane,
@@ -427,8 +427,8 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
     try:
         trajectory = reader.trajectory(row["config_key"], row["seed"])
     except QueryError as error:
-        raise NotFoundError(
-            f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it."
+        raise RequestError(
+            f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it.", 404
         ) from error
     config = json.loads(row["config_json"])
     system = _system(config)
@@ -491,9 +491,10 @@ def _row(reader: Reader, params: QueryParams) -> Content:
     key = params.text("trial_key")
     found = reader.rows(_TRIAL, trial_key=key)
     if not found:
-        raise NotFoundError(
+        raise RequestError(
             f"There is no trial '{truncated(key, 20)}' in {reader.safe_url}: "
-            f"choose one of the trials page."
+            f"choose one of the trials page.",
+            404,
         )
     return dict(zip(found.columns, found[0], strict=True))
 

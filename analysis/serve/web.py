@@ -41,19 +41,11 @@ LARGEST = 2**31 - 1
 
 
 class RequestError(AnalysisError):
-    """A query parameter has an invalid value."""
+    """A request that is not answered, with its HTTP status: 400 for an invalid parameter."""
 
-
-class NotFoundError(AnalysisError):
-    """The trial does not exist."""
-
-
-class ForbiddenError(AnalysisError):
-    """The request comes from another site, or needs a right that is not given."""
-
-
-class BusyError(AnalysisError):
-    """Too many queries are running."""
+    def __init__(self, sentence: str, status: int = 400) -> None:
+        super().__init__(sentence)
+        self.status = status
 
 
 class QueryParams:
