@@ -16,6 +16,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import reprlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -105,11 +106,14 @@ def _size(value: object) -> float:
     return value if isinstance(value, int | float) else math.inf
 
 
-def read_condition(text: str) -> tuple[str, object] | None:
-    """Return path and value, as JSON or text, of ``PATH=VALUE``; None if it is not so written."""
+def read_condition(text: str) -> tuple[str, object]:
+    """Return path and value, as JSON or text, of ``PATH=VALUE``; raise AnalysisError for others."""
     path, equals, value = text.partition("=")
     if not equals or not path:
-        return None
+        raise AnalysisError(
+            f"--where {reprlib.repr(text)} is no condition, PATH=VALUE is expected, such as "
+            f"model.width=32: correct it."
+        )
     try:
         return path, json.loads(value)
     except (ValueError, RecursionError):

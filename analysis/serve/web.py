@@ -90,21 +90,11 @@ class QueryParams:
 
     def filter(self, environment: str) -> Filter:
         """Return the filter of an environment's configurations with ``where`` and ``width``."""
-        conditions = dict(_condition(word) for word in self.text("where").split())
+        conditions = dict(map(read_condition, self.text("where").split()))
         width = self.integer("width", low=1)
         if width is not None:
             conditions["model.width"] = width
         return Filter((environment,), (), conditions)
-
-
-def _condition(word: str) -> tuple[str, object]:
-    found = read_condition(word)
-    if found is None:
-        raise RequestError(
-            f"'where' holds '{truncated(word)}', conditions PATH=VALUE are expected: "
-            f"write for instance policy.form=dual."
-        )
-    return found
 
 
 def truncated(text: str, length: int = 60) -> str:

@@ -64,39 +64,18 @@ def features(system: System, x: Tensor) -> Tensor:
     return torch.stack(values, dim=-1)
 
 
-class Layer(NamedTuple):
-    """Linear layers of n trials."""
-
-    weights: Tensor  # (n, inputs, outputs)
-    biases: Tensor  # (n, 1, outputs)
-
-    def __call__(self, h: Tensor) -> Tensor:
-        """Return the outputs, (n, N, ·), at inputs (n, N, ·)."""
-        return torch.baddbmm(self.biases, h, self.weights)
-
-
-def layers(theta: Tensor, shapes: Sequence[tuple[int, int]]) -> list[Layer]:
-    """Cut parameters, (n, q), into layers of the shapes (inputs, outputs).
-
-    Each layer has its matrix, outputs by inputs, and then its biases.
-    """
-    parts = iter(theta.split([n for n_in, n_out in shapes for n in (n_in * n_out, n_out)], dim=1))
-    return [
-        Layer(next(parts).unflatten(1, (n_out, n_in)).mT, next(parts).unsqueeze(1))
-        for n_in, n_out in shapes
-    ]
-
-
 def mlp_function(system: System, model: MLP) -> BatchModel:
-    """Return layers with tanh between them."""
+    """Return layers with tanh between them; each has its matrix, outputs by inputs, and biases."""
     shapes = list(zip(model.layer_inputs(system), model.layer_sizes(system)[1:], strict=True))
+    sizes = [n for n_in, n_out in shapes for n in (n_in * n_out, n_out)]
 
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        *hidden, output = layers(theta, shapes)
+        parts = iter(theta.split(sizes, dim=1))
         h = features(system, x).expand(len(theta), -1, -1)
-        for layer in hidden:
-            h = layer(h).tanh()
-        return output(h)
+        for layer, (n_in, n_out) in enumerate(shapes):
+            W, b = next(parts).unflatten(1, (n_out, n_in)).mT, next(parts).unsqueeze(1)
+            h = torch.baddbmm(b, h.tanh() if layer else h, W)
+        return h
 
     return accelerations
 
