@@ -13,7 +13,7 @@ import functools
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -275,9 +275,6 @@ class PlotOptions:
     statistic: Statistic = Statistic.MEAN
     spread: Spread = Spread.BAND
     epsilon: float | None = None
-
-    def as_dict(self) -> dict[str, str]:
-        return {key: str(value) for key, value in asdict(self).items()}
 
 
 Limits = tuple[float, float]
