@@ -170,7 +170,7 @@ def _kernel_alone(what: str, parts: tuple[System, Policy, Model, Learner]) -> st
     why = in_torch[0] if in_torch else "path is 'reference', as with executor=lockstep"
     return (
         f"{what} runs in the compiled kernel alone, but {why}: choose compiled parts alone and "
-        f"leave path out, or what runs in torch: the policies "
+        f"leave path out, with executor=local, or what runs in torch: the policies "
         f"{', '.join(one.name for one in REFERENCE_POLICIES)}, open-loop ones and plans in numpy, "
         f"with learner 'adam' or 'adam_window'."
     )
