@@ -35,7 +35,7 @@ from analysis.figures.panels import (
 from analysis.stats.curves import (
     DrawnPlane,
     average_spectrum,
-    mean,
+    centre,
     median_seed,
     standard_error,
 )
@@ -136,7 +136,7 @@ def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Por
         line=plane.line(points) if len(points) else points,
         start=plane.wrapped(points[:1])[0] if len(points) else np.full(2, np.nan),
         diverged=status.get(seed) == "diverged",
-        coverage=float(mean(shares)),
+        coverage=float(centre(shares)),
         coverage_error=float(standard_error(shares)),
         n=len(shares),
         n_diverged=len(finished) - len(shares),

@@ -100,17 +100,12 @@ def standard_error(values: Array) -> Array:
     return error
 
 
-def mean(values: Array) -> Array:
-    """Return the mean along the first axis of (n, ...), NaN for none."""
-    return centre(values, Statistic.MEAN)
-
-
 def mean_columns(name: str, values: Array) -> dict[str, float]:
     """Return the mean of (n,) and two standard errors, as columns ``name`` and ``name_2se``."""
-    return {name: float(mean(values)), f"{name}_2se": 2 * float(standard_error(values))}
+    return {name: float(centre(values)), f"{name}_2se": 2 * float(standard_error(values))}
 
 
-def centre(values: Array, statistic: Statistic) -> Array:
+def centre(values: Array, statistic: Statistic = Statistic.MEAN) -> Array:
     """Return a statistic along the first axis of (n, ...), NaN for none."""
     if not len(values):
         return np.full(values.shape[1:], np.nan)

@@ -33,7 +33,7 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.stats.curves import mean, mean_columns
+from analysis.stats.curves import centre, mean_columns
 from analysis.stats.scores import (
     BySeed,
     benjamini_hochberg,
@@ -398,4 +398,4 @@ def _free_run(found: Assessments, t: int, reached: int) -> dict[str, object]:
     """Return the mean error after t steps, and of how many trials it is not finite."""
     errors = found.values[:, found.t == t]
     finite = errors[np.isfinite(errors)]
-    return {"free_run": float(mean(finite)), "free_run_lost": max(0, reached - len(finite))}
+    return {"free_run": float(centre(finite)), "free_run_lost": max(0, reached - len(finite))}

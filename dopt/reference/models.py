@@ -23,7 +23,7 @@ import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -489,13 +489,6 @@ def cholesky_factor(matrix: Tensor) -> Tensor:
     return torch.where((failed > 0)[:, None, None], torch.nan, factor)
 
 
-class QuadraticProblem(NamedTuple):
-    """Equation 7 for a batch of n trials: maximise uᵀQu - 2vᵀu on the sphere."""
-
-    Q: Tensor  # (n, m, m)
-    v: Tensor  # (n, m)
-
-
 def predicted_states(system: System, model: BatchModel, theta: Tensor, x: Tensor) -> Tensor:
     """Return x̄ of every trial, (n, d), for parameters (n, q) and states (n, d)."""
     zero = torch.zeros(len(x), system.n_inputs, dtype=x.dtype, device=x.device)
@@ -521,10 +514,14 @@ def planning_columns(
     return torch.cat([g.view(n, m, -1)[:, :1], DB.view(n, m, -1)], dim=1)
 
 
+QuadraticProblem = tuple[Tensor, Tensor]
+"""Q, (n, m, m), and v, (n, m), of equation 7: maximise uᵀQu - 2vᵀu on the sphere."""
+
+
 def quadratic_problem(columns: Tensor, information: BatchInformation) -> QuadraticProblem:
     """Return Q and v from the :func:`planning_columns`, (n, 1 + m, s)."""
     forms = columns @ information.solve(columns.mT)
-    return QuadraticProblem(forms[:, 1:, 1:], -forms[:, 1:, 0])
+    return forms[:, 1:, 1:], -forms[:, 1:, 0]
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:

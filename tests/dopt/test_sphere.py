@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from dopt.errors import DoptError
 from dopt.policies.search import LARGEST_REPELLED, sphere_directions
-from dopt.reference.models import QuadraticProblem, d_optimal_inputs, maximize_on_spheres
+from dopt.reference.models import d_optimal_inputs, maximize_on_spheres
 from dopt.sphere import maximize_on_sphere, sphere_maximizer
 
 
@@ -248,7 +248,7 @@ def test_both_solvers_bear_numbers_of_any_size(unit: float, radius: float) -> No
 @pytest.mark.parametrize("v", [-0.7, 0.0, 0.7])
 @pytest.mark.parametrize("tie", [-1.0, 0.0, 1.0])
 def test_one_input_takes_the_side_that_the_kernel_takes(v: float, tie: float) -> None:
-    problem = QuadraticProblem(torch.ones(1, 1, 1).double(), torch.tensor([[v]]).double())
+    problem = torch.ones(1, 1, 1).double(), torch.tensor([[v]]).double()
     u = d_optimal_inputs(problem, 2.0, torch.tensor([[tie]]).double())
     assert float(u) == (2.0 if v < 0.0 or (v == 0.0 and tie > 0.0) else -2.0)
 
@@ -269,6 +269,6 @@ def test_a_batch_is_its_problems_one_by_one(
 def test_a_problem_that_is_not_finite_has_no_input_and_disturbs_no_other(m: int) -> None:
     Q, v = torch.eye(m).double().repeat(3, 1, 1), torch.ones(3, m).double()
     Q[1, -1, -1], v[1, 0], v[2, 0] = torch.nan, torch.nan, torch.nan
-    u = d_optimal_inputs(QuadraticProblem(Q, v), 2.0, torch.ones(3, m).double())
+    u = d_optimal_inputs((Q, v), 2.0, torch.ones(3, m).double())
     assert torch.allclose(u[0], torch.full((m,), -2.0 / m**0.5).double())
     assert u[1:].isnan().all()
