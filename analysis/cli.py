@@ -196,15 +196,9 @@ def add_database(command: Parser) -> None:
 
 def wanted(options: argparse.Namespace) -> Filter:
     """Return the selection that the options of :func:`add_selection` ask for."""
-    where = [read_condition(text) for text in options.where]
-    if None in where:
-        raise AnalysisError(
-            f"--where {options.where[where.index(None)]} is no condition, PATH=VALUE is expected: "
-            f"write for instance --where model.width=32."
-        )
     reference = getattr(options, "reference", REFERENCE)
     group_by = tuple(getattr(options, "group_by", ("policy",)))
-    conditions = dict(one for one in where if one)
+    conditions = dict(map(read_condition, options.where))
     return Filter(tuple(options.env), tuple(options.policy), conditions, reference, group_by)
 
 

@@ -54,6 +54,9 @@ TABLE_FILES = ("md", "tex", "csv")
 
 PAGE = "README.md"
 
+IDENTITY = ("env", "policy", "model", "learner", "width", "config_key")
+"""Columns by which a configuration is named in the provenance."""
+
 PICTURES = ("pdf", "svg", "png")
 
 
@@ -107,7 +110,8 @@ def _made(
     part = (plots() if is_figure else TABLES)[name].part(selection, options)
     if not part.entries:
         return "not drawn, nothing is stored for it"
-    facts = describe(reader, part) | {"request": options.as_dict(), "name": name}
+    request = {key: str(value) for key, value in dataclasses.asdict(options).items()}
+    facts = describe(reader, part) | {"request": request, "name": name}
     # Where the data lie and which commit was checked out is no part of the fingerprint.
     marked = ("selection", "request", "versions", "name", "notes")
     mark = fingerprint({key: facts[key] for key in marked} | {"code": code_hash()})
@@ -204,15 +208,10 @@ def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
         # The key of released files, of what is a configuration everywhere else.
         "cells": [
             {
-                "env": entry.config.env,
-                "policy": entry.config.policy,
-                "model": entry.config.model,
-                "learner": entry.config.learner,
-                "width": entry.config.width,
-                "config_key": entry.config.config_key,
+                **{name: getattr(entry.config, name) for name in IDENTITY},
                 "n_registered": len(entry.trials),
                 "n_finished": len(entry.finished),
-                "n_diverged": sum(trial.status == "diverged" for trial in entry.trials),
+                "n_diverged": entry.n_diverged,
                 "n_missing": missing.get((entry.config.env, entry.config.policy), 0),
             }
             for entry in selection.entries

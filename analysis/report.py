@@ -154,7 +154,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         notes,
         _origin(facts, controlled=controlled is not None),
         pictures,
-        [] if controlled is None else [control_section(controlled)],
+        controlled,
     )
     outputs.write_text(text, options.out / outputs.PAGE)
     outputs.write_provenance(facts, options.out, NAME)
@@ -189,12 +189,12 @@ def write_report(
     notes: Sequence[str],
     origin: str,
     pictures: Mapping[str, str],
-    more: Sequence[str] = (),
+    controlled: pd.DataFrame | None = None,
 ) -> str:
     """Return the page of a table of :func:`analysis.tables.variants.adjust`.
 
-    ``pictures`` are files, without their ending, by environment, and ``more`` further sections,
-    already in Markdown.
+    ``pictures`` are files, without their ending, by environment, and ``controlled`` is a table of
+    :func:`tabulate_control_of`.
     """
     parts = {str(env): records(part) for env, part in table.groupby("env", sort=False)}
     sections = [
@@ -207,8 +207,9 @@ def write_report(
         "## What was compared",
         _described(table),
         *(_section(env, rows, pictures.get(env)) for env, rows in parts.items()),
-        *more,
     ]
+    if controlled is not None:
+        sections.append(control_section(controlled))
     if notes:
         sections.append("## Notes\n\n" + "\n".join(f"- {note}" for note in notes))
     return "\n\n".join(sections) + "\n"

@@ -167,11 +167,6 @@ def but_diverged(count: int, diverged: int) -> str:
     return f"{count}, {diverged} diverged" if diverged else str(count)
 
 
-def of_finished(used: int, finished: int, diverged: int) -> str:
-    """Return how many finished trials are in a statistic, such as ``98/100, 2 diverged``."""
-    return f"{used}/{finished}, {diverged} diverged" if diverged else str(used)
-
-
 def count_text(counts: Mapping[str, str]) -> str:
     """Return the counts by policy as a text: the commonest one, then those that differ from it.
 

@@ -1,8 +1,7 @@
-"""Checks of the arguments of explorers and fits."""
+"""Checks of arguments: kinds, whole and real numbers, and rows of them."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from types import UnionType
 from typing import Any
@@ -12,11 +11,6 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.fields import LARGEST_WHOLE
-from dopt.policies.base import ROUNDING
-from dopt.registry import section_of
-from dopt.spec.trial import TrialSpec
-from dopt.systems.base import System
-from dopt.systems.black_box import BlackBox
 from dopt.types import Array
 
 
@@ -31,7 +25,7 @@ def whole(what: str, given: object, lower: int = -LARGEST_WHOLE, upper: int = LA
     """Return a whole number within bounds, or raise SpecificationError."""
     if not _is_real(given, "iu") or not lower <= int(given) <= upper:  # type: ignore[call-overload]
         least = f" of at least {lower}" if lower > -LARGEST_WHOLE else ""
-        bounds = f" from {lower} to {upper:,}" if upper < LARGEST_WHOLE else least
+        bounds = f" from {lower} to {upper:,}" if upper != LARGEST_WHOLE else least
         raise SpecificationError(
             f"{what} is {given!r}, but a whole number{bounds} is expected: correct it."
         )
@@ -70,15 +64,25 @@ def finite(what: str, given: npt.ArrayLike, size: int) -> Array:
     return values
 
 
-def safe_input(spec: TrialSpec, fallback: npt.ArrayLike | None) -> Array:
-    """Return the fallback, (m,), 0 unless it is given, or raise SpecificationError."""
-    m, gamma = spec.system.n_inputs, spec.system.gamma
-    u = np.zeros(m) if fallback is None else finite("fallback", fallback, m)
-    if np.linalg.norm(u) > gamma * (1 + ROUNDING):
+def rows_of(what: str, given: npt.ArrayLike, size: int) -> Array:
+    """Return rows of so many real numbers, (N, size), or raise SpecificationError."""
+    values = np.atleast_2d(reals(what, given))
+    if values.ndim != 2 or values.shape[1] != size:
         raise SpecificationError(
-            f"fallback is {u.tolist()}, but its norm has to be at most {gamma:g}: lower it."
+            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
+            f"them."
         )
-    return u
+    return values
+
+
+def check_finite(what: str, values: Array) -> None:
+    """Raise SpecificationError unless all numbers of some rows are finite."""
+    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(wrong):
+        raise SpecificationError(
+            f"row {wrong[0]} of the {what} is {values[wrong[0]].tolist()}, but finite numbers are "
+            f"expected: give a part without such rows."
+        )
 
 
 def within(what: str, given: float, upper: float) -> float:
@@ -114,37 +118,3 @@ def as_array(given: Any) -> npt.NDArray[Any]:
         return np.asarray(given, dtype=object)
     except (TypeError, RuntimeError):
         return np.array(None)
-
-
-# Systems that are stepped somewhere else, as an explorer sees them.
-
-
-def measured(system: System) -> System:
-    """Return a system of which nothing but its declaration is used.
-
-    A black box, such as an environment of Gymnasium, is not started: its known part is compiled,
-    and its states are those that the explorer is told.
-
-    Raises
-    ------
-    SpecificationError
-        If its outputs mix states: those that begin an exploration would be unknown.
-    """
-    if system.output_matrix:
-        raise SpecificationError(
-            f"env.output_matrix is {list(system.output_matrix)}, but an explorer is told states, "
-            f"all of them or some: set env.measured_states, or take the outputs for states."
-        )
-    if not isinstance(system, BlackBox) or system.measured:
-        return system
-    kind, section = type(system), section_of(system)
-    declared: dict[str, Any] = {
-        "compiled": True,
-        "measured": True,
-        "to_section": lambda self: section,  # noqa: ARG005  # the system's own
-        "__module__": kind.__module__,
-    }
-    explored: type[System] = dataclasses.dataclass(frozen=True, kw_only=True)(
-        type(kind.__name__, (kind,), declared)
-    )
-    return explored(**{key.name: getattr(system, key.name) for key in dataclasses.fields(system)})

@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,6 @@ from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.limits import VIOLATIONS, WORST
 from dopt.models import MLP, Linear, Model
-from dopt.models.linear import linear_terms
 from dopt.offline_fit import sample_loss
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
@@ -149,10 +148,6 @@ def coverage(points: Array, box: Box, cells: int = CELLS) -> float:
     return float(np.mean(counts > 0))
 
 
-TOLERANCE = 1e-9
-"""Relative difference of two mean squares of regressors that counts as rounding."""
-
-
 def true_parameters(system: System, step: int = 0, names: Sequence[str] = ()) -> Array:
     """Return the true values, (q,), of physical parameters at a step, in their units.
 
@@ -181,33 +176,6 @@ def parameter_error(
     They are the named parameters, or by default the linear model's.
     """
     return float(np.linalg.norm(np.asarray(parameters) - true_parameters(system, step, names)))
-
-
-def loss_by_parameter_error(system: System) -> float:
-    """Return c such that the loss of the linear model is c ‖θ - θ*‖₂ for every θ.
-
-    The squared loss is (θ - θ*)ᵀ G (θ - θ*), with G the mean of ΨᵀΨ over the evaluation grid. It is
-    a multiple of the squared parameter error if G = c² I.
-
-    Raises
-    ------
-    SpecificationError
-        If G is no multiple of the identity matrix, or the system changes with time.
-    """
-    q, points = len(true_parameters(system)), evaluation_set(system)
-    at = system.points(points.states, points.inputs)[: points.n_grid]
-    _, regressors = linear_terms(system, at)
-    G = np.einsum("nri,nrj->ij", regressors, regressors) / len(at)
-    square = float(G[0, 0])
-    if len(system.history) > 1 or not np.allclose(
-        G, square * np.eye(q), rtol=0.0, atol=TOLERANCE * abs(square)
-    ):
-        raise SpecificationError(
-            f"the loss of env '{system.name}' weighs its parameters differently, but a parameter "
-            f"error follows from a loss that weighs all alike: run the trials again with "
-            f"dopt.run and compare their parameters."
-        )
-    return float(np.sqrt(square))
 
 
 KEPT_OUTCOMES = 4096
@@ -264,25 +232,22 @@ def assess(
             goal, noise = task.on(spec.system), _control_noise(spec.system, task, spec.seed)
             truth = true_forecast(spec.system)
             episode = run_feedback(spec.system, goal, truth, feedbacks[t], noise)
-            rows += _measured(t, "feedback", Outcome(episode.success, episode.cost))
+            rows += _measured(t, "feedback", (episode.success, episode.cost))
         error = free_run_error(spec.system, forecast, task.free_run_steps)
         rows.append(Assessment(t, "free_run_error", error))
         rows.append(Assessment(t, "coverage", plane.coverage(states[: t + 1])))
     return tuple(rows)
 
 
-class Outcome(NamedTuple):
-    """Success and cost of an episode."""
-
-    success: bool
-    cost: float
+Outcome = tuple[bool, float]
+"""Success and cost of an episode."""
 
 
 def _controlled(system: System, task: Control, seed: int, forecast: Forecast) -> Outcome:
     """Run an episode; all of a seed share the noise and the planner's draws."""
     noise, plans = _control_noise(system, task, seed), stream(seed, "control_plans")
     episode = run_episode(system, task, true_forecast(system), forecast, noise, plans)
-    return Outcome(episode.success, episode.cost)
+    return episode.success, episode.cost
 
 
 def _control_noise(system: System, task: Control, seed: int) -> Array:
@@ -309,8 +274,9 @@ def _initial(system: System, model: Model, seed: int) -> Array:
 
 
 def _measured(t: int, name: str, outcome: Outcome) -> Iterator[Assessment]:
-    yield Assessment(t, f"{name}_success", float(outcome.success))
-    yield Assessment(t, f"{name}_cost", outcome.cost)
+    success, cost = outcome
+    yield Assessment(t, f"{name}_success", float(success))
+    yield Assessment(t, f"{name}_cost", cost)
 
 
 def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:

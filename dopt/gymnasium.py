@@ -16,6 +16,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from dopt.arguments import instance
 from dopt.errors import DoptError, SpecificationError
 from dopt.fields import parameter, unvalidated
 from dopt.models import MLP
@@ -63,10 +64,7 @@ class Environment(BlackBox):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.restarts, bool):
-            raise SpecificationError(
-                f"env.restarts is {self.restarts!r}, but true or false is expected: set it to one."
-            )
+        instance("env.restarts", self.restarts, bool, "true or false")
 
     @staticmethod
     @abstractmethod

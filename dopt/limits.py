@@ -17,9 +17,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dopt.arguments import instance, within
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, parameter, unvalidated
-from dopt.registry import is_none
 from dopt.systems.base import System
 from dopt.types import Array
 
@@ -33,7 +33,10 @@ Interval = tuple[float, float]
 class Limits(Validated):
     """Bounds that a trial has to heed.
 
-    >>> Limits.from_section({"name": "box", "bounds": {"y": [-2, 2]}, "rates": {"u": 100}})
+    >>> Limits(bounds=(("y", -2.0, 2.0),), rates=(("u", 100.0),))
+
+    In a section of a configuration ``bounds`` maps names to pairs, with null where there is no
+    bound, and ``rates`` names to numbers.
 
     Parameters
     ----------
@@ -62,35 +65,17 @@ class Limits(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        bounds = tuple((str(name), *_interval(str(name), pair)) for name, *pair in self.bounds)
-        rates = tuple((str(name), _rate(str(name), rate)) for name, rate in self.rates)
-        object.__setattr__(self, "bounds", bounds)
-        object.__setattr__(self, "rates", rates)
-        if not isinstance(self.enforced, bool):
-            raise _unlike("enforced", self.enforced, "true or false")
-
-    @classmethod
-    def from_section(cls, section: Mapping[str, Any]) -> Limits:
-        """Return the limits that a section of a configuration describes.
-
-        There ``bounds`` maps names to pairs, with null where there is no bound, and ``rates`` names
-        to numbers.
-
-        Raises
-        ------
-        SpecificationError
-            If a key is unknown, or a value is not as described.
-        """
-        keys = [field.name for field in dataclasses.fields(cls)]
-        for key in section:
-            if key not in ("name", *keys):
-                raise unknown_name("limits field", key, keys)
-        given = {key: value for key, value in section.items() if key != "name"}
-        bounds = tuple((name, *_pair(name, pair)) for name, pair in _named(section, "bounds"))
-        return cls(**given | {"bounds": bounds, "rates": tuple(_named(section, "rates"))})
+        bounds = ((name, *_interval(name, pair)) for name, pair in _named("bounds", self.bounds))
+        rates = (
+            (name, within(f"limits.rates.{name}", rate, math.inf))
+            for name, rate in _named("rates", self.rates)
+        )
+        object.__setattr__(self, "bounds", tuple(bounds))
+        object.__setattr__(self, "rates", tuple(rates))
+        instance("limits.enforced", self.enforced, bool, "true or false")
 
     def to_section(self) -> dict[str, object]:
-        """Return the section that :meth:`from_section` turns into these limits."""
+        """Return the section that describes these limits in a configuration."""
         return {
             "name": self.name,
             "bounds": {
@@ -151,60 +136,30 @@ class Limits(Validated):
 LIMITS: dict[str, type[Limits]] = {Limits.name: Limits}
 
 
-def limits_from(section: object) -> Limits | None:
-    """Return the limits that a configuration section describes; None without, or for "none"."""
-    if section is None or isinstance(section, Limits):
-        return section
-    if not isinstance(section, Mapping):
-        raise SpecificationError(
-            f"configuration key 'limits' is {section!r}, but a section with a name and fields is "
-            f"expected: choose limits=box, or limits=none."
-        )
-    if is_none("limits", section):
-        return None
-    if (name := section.get("name", Limits.name)) not in LIMITS:
-        raise unknown_name("limits", name, [*LIMITS, "none"])
-    return Limits.from_section(section)
-
-
 def names_of(labels: Sequence[str]) -> list[str]:
     """Return the names in labels such as ``"y [m]"``."""
     return [label.partition(" [")[0] for label in labels]
 
 
-def _named(section: Mapping[str, Any], key: str) -> list[tuple[str, Any]]:
-    given = section.get(key)
-    if given is None:
-        return []
-    if not isinstance(given, Mapping):
+def _named(key: str, given: object) -> list[tuple[str, Any]]:
+    """Return what a mapping, or tuples that begin with a name, give for each name."""
+    if isinstance(given, tuple):
+        return [(str(name), rest if len(rest) > 1 else rest[0]) for name, *rest in given]
+    if not isinstance(given, Mapping | None):
         raise _unlike(key, given, "a mapping of names")
-    return [(str(name), value) for name, value in given.items()]
+    return [(str(name), value) for name, value in (given or {}).items()]
 
 
-_PAIR = "a pair of numbers, the lower one first, or null for none"
-
-
-def _pair(name: str, given: object) -> tuple[object, object]:
-    if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray) or len(given) != 2:
-        raise _unlike(f"bounds.{name}", given, _PAIR)
-    return given[0], given[1]
-
-
-def _interval(name: str, pair: Sequence[object]) -> Interval:
-    if len(pair) != 2:
-        raise _unlike(f"bounds.{name}", list(pair), _PAIR)
-    low = -math.inf if pair[0] is None else _number(pair[0])
-    high = math.inf if pair[1] is None else _number(pair[1])
-    if not low < high:  # also where one is NaN
-        raise _unlike(f"bounds.{name}", list(pair), _PAIR)
-    return low, high
-
-
-def _rate(name: str, given: object) -> float:
-    rate = _number(given)
-    if not 0.0 < rate < math.inf:
-        raise _unlike(f"rates.{name}", given, "a positive number")
-    return rate
+def _interval(name: str, given: object) -> Interval:
+    pair: list[Any] = []
+    if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str):
+        pair = [*given]
+    ends = (-math.inf, math.inf)
+    found = [e if one is None else _number(one) for one, e in zip(pair, ends, strict=False)]
+    if len(pair) != 2 or not found[0] < found[1]:  # also where one is NaN
+        expected = "a pair of numbers, the lower one first, or null for none"
+        raise _unlike(f"bounds.{name}", pair or given, expected)
+    return found[0], found[1]
 
 
 def _number(given: object) -> float:

@@ -20,12 +20,14 @@ Computation 4 (1992), sections 2 and 3.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from dopt.arguments import check_finite, rows_of, whole, within
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.models.base import MLP, Model
@@ -176,21 +178,9 @@ def fit_offline(
         If the samples have other shapes or are not finite, the ridge or the number of steps is not
         positive, or the model is neither 'mlp', 'ensemble' nor linear in its parameters.
     """
-    if not (ridge > 0 and np.isfinite(ridge)):
-        raise SpecificationError(
-            f"ridge is {ridge}, but a number above 0 is expected: give for instance {RIDGE:g}."
-        )
-    if max_steps < 1:
-        raise SpecificationError(
-            f"max_steps is {max_steps}, but at least 1 is expected: give for instance {MAX_STEPS}."
-        )
-    x = _rows(states, spec.system.n_states, "states")
-    y = _rows(accelerations, spec.system.n_learned, "accelerations")
-    if len(x) != len(y) or not len(x):
-        raise SpecificationError(
-            f"there are {len(x)} states and {len(y)} accelerations, but as many of both, and at "
-            f"least one, are expected: give one row of each for every sample."
-        )
+    ridge, max_steps = within("ridge", ridge, math.inf), whole("max_steps", max_steps, 1)
+    x = rows_of("states", states, spec.system.n_states)
+    y = rows_of("accelerations", accelerations, spec.system.n_learned)
     u = None
     if spec.model.n_inputs_read(spec.system):
         if inputs is None:
@@ -198,11 +188,14 @@ def fit_offline(
                 f"model '{spec.model.name}' reads inputs, but none were given: give the input of "
                 f"each sample."
             )
-        u = _rows(inputs, spec.system.n_inputs, "inputs")
-        if len(u) != len(x):
+        u = rows_of("inputs", inputs, spec.system.n_inputs)
+    given = {"states": x, "accelerations": y} | ({} if u is None else {"inputs": u})
+    for what, values in given.items():
+        check_finite(what, values)
+        if len(values) != len(x) or not len(x):
             raise SpecificationError(
-                f"there are {len(x)} states and {len(u)} inputs, but as many of both are expected "
-                f"for model '{spec.model.name}', which reads inputs: give the input of each sample."
+                f"there are {len(x)} states and {len(values)} {what}, but as many of both, and at "
+                f"least one, are expected: give one row of each for every sample."
             )
     initial = initial_weights(spec)
     if is_network(spec.model):
@@ -239,21 +232,6 @@ def grid_loss(spec: TrialSpec, parameters: Array) -> float:
     if len(system.history) > 1:
         truth = system.learned(states, system.horizon - 1, inputs)
     return _root_mean_square(spec.model.predict(system, parameters, states, inputs) - truth)
-
-
-def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
-    rows = np.asarray(given, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise SpecificationError(
-            f"{what} have the shape {rows.shape}, but (N, {size}) is expected: give one row for "
-            f"each sample."
-        )
-    if not np.isfinite(rows).all():
-        raise SpecificationError(
-            f"{what} hold a number that is not finite, but finite ones are expected: leave out the "
-            f"samples from a divergence on."
-        )
-    return rows
 
 
 def _root_mean_square(errors: Array) -> float:

@@ -58,16 +58,32 @@ def build(section: str, registry: Mapping[str, type[T]], given: Part) -> T:
     return cls(**{key: value for key, value in given.items() if key not in _ABOUT})
 
 
-def is_none(section: str, given: Mapping[str, object]) -> bool:
-    """Return True for a section of the name "none", which has no other keys."""
+def build_optional(section: str, registry: Mapping[str, type[T]], given: object) -> T | None:
+    """Return what a section that may be left out describes; None without it, or named "none".
+
+    Without a name it is the first class of the registry.
+
+    Raises
+    ------
+    SpecificationError
+        As :func:`build`; also if it is no section, or one of the name "none" has other keys.
+    """
+    first = next(iter(registry))
+    if not isinstance(given, Mapping | Validated | None):
+        raise SpecificationError(
+            f"configuration key '{section}' is {given!r}, but a section with a name and fields is "
+            f"expected: choose {section}={first}, or {section}=none."
+        )
+    if given is None or isinstance(given, Validated):
+        return cast("T | None", given)
     if given.get("name") != "none":
-        return False
+        return build(section, registry, given if TARGET in given else {"name": first, **given})
     if others := ", ".join(key for key in map(str, given) if key != "name"):
         raise SpecificationError(
             f"{section}=none has {others}, but no other key than its name is expected: leave it "
             f"out, or choose an option that has it."
         )
-    return True
+    return None
 
 
 def section_of(item: Validated) -> dict[str, object]:

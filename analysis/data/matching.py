@@ -16,16 +16,15 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import reprlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-from dopt.errors import DoptError, SpecificationError
-from dopt.limits import Limits
+from dopt.errors import DoptError
 from dopt.registry import SOURCE, TARGET
-from dopt.spec.config import flatten
-from dopt.spec.trial import TrialSpec, is_fit
+from dopt.spec.config import difference, flatten, section_name, unusual
+from dopt.spec.trial import is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
 
 
@@ -94,11 +93,7 @@ class Filter:
             found = {json.dumps(entry[path]): entry[path] for entry in flat if path in entry}
             stored = sorted(found, key=lambda text: (_size(found[text]), text))
             if not stored:
-                near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
-                raise AnalysisError(
-                    f"--where {path} names no value of a stored configuration: "
-                    f"choose for instance one of {', '.join(near) or 'model.width, env.gamma'}."
-                )
+                raise _no_setting(f"--where {path} names no value", path, flat)
             if not any(entry.get(path) == value for entry in flat if path in entry):
                 text = json.dumps(value, default=str)
                 raise AnalysisError(
@@ -111,11 +106,14 @@ def _size(value: object) -> float:
     return value if isinstance(value, int | float) else math.inf
 
 
-def read_condition(text: str) -> tuple[str, object] | None:
-    """Return path and value, as JSON or text, of ``PATH=VALUE``; None if it is not so written."""
+def read_condition(text: str) -> tuple[str, object]:
+    """Return path and value, as JSON or text, of ``PATH=VALUE``; raise AnalysisError for others."""
     path, equals, value = text.partition("=")
     if not equals or not path:
-        return None
+        raise AnalysisError(
+            f"--where {reprlib.repr(text)} is no condition, PATH=VALUE is expected, such as "
+            f"model.width=32: correct it."
+        )
     try:
         return path, json.loads(value)
     except (ValueError, RecursionError):
@@ -158,13 +156,17 @@ def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
     """Raise AnalysisError for a setting that no configuration has."""
     for key in keys:
         if all(setting_value(config, key) is None for config in configs):
-            known = {*COLUMNS}.union(*(flatten(config.config) for config in configs))
-            near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)
-            raise AnalysisError(
-                f"'{key}' is no setting of a stored configuration, but a column or a dotted path "
-                f"is expected: choose for instance one of "
-                f"{', '.join(near) or 'policy, learner, width, env.gamma'}."
-            )
+            flat = [flatten(config.config) for config in configs]
+            raise _no_setting(f"'{key}' is no setting", key, [*flat, dict.fromkeys(COLUMNS)])
+
+
+def _no_setting(said: str, path: str, flat: Sequence[Mapping[str, object]]) -> AnalysisError:
+    """Return the error for a path that no flat configuration has, with the nearest that some do."""
+    near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
+    return AnalysisError(
+        f"{said} of a stored configuration: choose for instance one of "
+        f"{', '.join(near) or 'model.width, env.gamma'}."
+    )
 
 
 def _choose_policies(group: Sequence[ConfigRow], reference: str) -> list[ConfigRow]:
@@ -220,39 +222,10 @@ def nearness(config: ConfigRow) -> tuple[int, int, int, bool]:
     not defaults of what is named, then no task: it changes nothing of the trial. Last come stored
     sample losses.
     """
-    usual, parts = defaults(config), _sections(config)
-    task = parts.pop("task", None) is not None
-    sampled = parts.pop("assess", None) is not None
-    own = flatten(parts) if usual else {}
-    names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
-    return (
-        -sum(names),
-        -sum(usual.get(path) != value for path, value in own.items()),
-        -task,
-        sampled,
-    )
-
-
-def defaults(config: ConfigRow) -> dict[str, object]:
-    """Return the defaults of what a configuration names, without its task, as dotted paths.
-
-    Of limits, all settings except the name: a configuration without limits is nearer than one with
-    any. Empty if the system or the policy is a user's class, which is not registered here.
-    """
-    names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
-    for key in ("task", "assess"):
-        names.pop(key, None)
-    limits = Limits().to_section() if names.pop("limits", None) else {}
-    limits.pop("name", None)
-    try:
-        usual = TrialSpec.from_mapping(names).to_mapping()
-        return flatten({**usual, "limits": limits})
-    except (SpecificationError, KeyError):  # a plant is more than its name
-        return {}
-
-
-def _sections(config: ConfigRow) -> dict[str, Mapping[str, Any]]:
-    return {key: value for key, value in config.config.items() if isinstance(value, Mapping)}
+    own = {key: part for key, part in config.config.items() if key not in ("task", "assess")}
+    names = [section_name(own, section) != name for section, name in USUAL.items()]
+    task, sampled = (bool(config.config.get(key)) for key in ("task", "assess"))
+    return -sum(names), -len(unusual(own)), -task, sampled
 
 
 def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:
@@ -269,26 +242,6 @@ def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:
 def _setting(config: ConfigRow) -> Setting:
     sections = (config.config.get(name) for name in ("env", "limits", "model", "learner"))
     return tuple(json.dumps(section, sort_keys=True) for section in sections)
-
-
-def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
-    """Return the first dotted path in which configurations differ, and its values.
-
-    One that all of them have goes before one that some lack.
-    """
-    flat = [flatten(config) for config in configs]
-    paths = differing_paths(flat)
-    if not paths:
-        return "config_key", [None for _ in configs]
-    path = min(paths, key=lambda one: (not all(one in entry for entry in flat), one))
-    return path, [entry.get(path) for entry in flat]
-
-
-def differing_paths(flat: Sequence[Mapping[str, Any]]) -> set[str]:
-    """Return the dotted paths in which some flat configurations differ."""
-    first = flat[0]
-    paths = set().union(*flat)
-    return {path for path in paths if any(own.get(path) != first.get(path) for own in flat)}
 
 
 def accepted(reader: Reader, wanted: Filter) -> list[ConfigRow]:

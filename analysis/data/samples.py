@@ -12,7 +12,6 @@ results.model(trial).predict(states)   # learned accelerations (N, r) of a row o
 
 from __future__ import annotations
 
-import json
 import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -28,12 +27,12 @@ from analysis.data.matching import (
     accepted,
     choose,
     latest_sources,
-    read_condition,
 )
 from analysis.data.selection import Entry, environment_rank, policy_rank
-from analysis.style import of_finished
 from dopt.assessment import SAMPLE_LOSS, Plane
-from dopt.limits import VIOLATIONS, limits_from
+from dopt.evaluation import rates
+from dopt.limits import LIMITS
+from dopt.registry import build_optional
 from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
@@ -49,30 +48,6 @@ from orchestrate.store.records import stacked
 from orchestrate.store.schema import STEP_VALUES
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Curves that enter a statistic: of the trials that did not diverge.
-
-    Attributes
-    ----------
-    seeds : (n,)
-    values : (n, T)
-        Finite.
-    n_finished : int
-        Trials that ran to an end, diverged ones included.
-    n_diverged : int
-    """
-
-    seeds: Integers
-    values: Array
-    n_finished: int
-    n_diverged: int
-
-    def describe(self) -> str:
-        """Return the count to print, such as ``98/100, 2 diverged``."""
-        return of_finished(len(self.values), self.n_finished, self.n_diverged)
-
-
 def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     """Return one column of the entry's finished trials.
 
@@ -86,11 +61,11 @@ def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
     return Curves(curves.seeds[kept], curves.t[:n], curves.values[kept, :n], curves.diverged[kept])
 
 
-def read_sample(reader: Reader, entry: Entry, column: str) -> Sample:
+def read_sample(reader: Reader, entry: Entry, column: str) -> Curves:
     """Return the curves (n, T) that a statistic sees: a diverged trial leaves its whole curve."""
     curves = read_curves(reader, entry, column)
-    lost = curves.diverged
-    return Sample(curves.seeds[~lost], curves.values[~lost], len(lost), int(lost.sum()))
+    kept = ~curves.diverged
+    return Curves(curves.seeds[kept], curves.t, curves.values[kept], curves.diverged[kept])
 
 
 def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array]:
@@ -98,24 +73,11 @@ def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array
 
     Bounds are in the unit of the state, infinite where a side is unbounded.
     """
-    limits = limits_from(config.get("limits"))
+    limits = build_optional("limits", LIMITS, config.get("limits"))
     if limits is None:
         return {}
     bounds = limits.of_states(system)
     return {int(i): bounds[i] for i in np.flatnonzero(np.isfinite(bounds).any(axis=1))}
-
-
-def violation_shares(reader: Reader, entry: Entry) -> dict[int, float]:
-    """Return the share of steps after which a bound is exceeded, by the seed of a finished trial.
-
-    Steps before a trial diverged count. Trials without limits have none.
-    """
-    found = reader.assessments(entry.config.config_key, VIOLATIONS)
-    values = found.values / np.maximum(found.t, 1)
-    counted = dict(zip(found.seeds.tolist(), values, strict=True))
-    rows = {one.seed: counted[one.seed] for one in entry.finished if one.seed in counted}
-    finite = {seed: row[np.isfinite(row)] for seed, row in rows.items()}
-    return {seed: float(row.sum()) for seed, row in finite.items() if len(row)}
 
 
 def sample_losses(reader: Reader, entry: Entry) -> dict[int, float]:
@@ -172,16 +134,10 @@ class LearnedModel:
         """
         values = learned_accelerations(self.spec, self.parameters, states, inputs)
         if inputs is not None:
-            x, u = np.atleast_2d(states), np.atleast_2d(inputs)
-            values = self._derivative(x, u, values)
+            x, u = np.atleast_2d(np.asarray(states, float)), np.atleast_2d(inputs)
+            accelerations = values
+            values = rates(self.spec.system, lambda *_: accelerations, u, x)
         return values[0] if np.ndim(states) == 1 else values
-
-    def _derivative(self, x: Array, u: Array, accelerations: Array) -> Array:
-        system = self.spec.system
-        known = system.known(tuple(x.T), tuple(u.T), system.parameters)
-        flow = np.stack([np.broadcast_to(row, len(x)) for row in known], axis=-1).astype(float)
-        flow[:, list(system.learned_rows)] += accelerations
-        return flow
 
 
 def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
@@ -210,8 +166,8 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
 def read_request(env: object, policy: object, where: object) -> Filter:
     """Return the filter of a request; raise AnalysisError for arguments of another kind."""
     return Filter(
-        _names("env", env, "pendulum", "cartpole"),
-        _names("policy", policy, "random", "d_optimal"),
+        _names("env", env, "pendulum"),
+        _names("policy", policy, "random"),
         {} if where is None else _conditions(where),
     )
 
@@ -231,29 +187,24 @@ def trial_key(trial: object) -> str:
     )
 
 
-def _names(what: str, given: object, *example: str) -> tuple[str, ...]:
+def _names(what: str, given: object, example: str) -> tuple[str, ...]:
     if isinstance(given, str):
         return (given,)
     names = tuple(given) if isinstance(given, Iterable) else (given,)
-    known = tuple(name for name in names if isinstance(name, str))
-    if len(known) < len(names):
-        one, two = map(json.dumps, example)
-        raise AnalysisError(
-            f"{what} is {_short(given)}, but a name or a list of names is expected: "
-            f"write for instance {what}={one} or {what}=[{one}, {two}]."
-        )
-    return known
+    if all(isinstance(name, str) for name in names):
+        return names
+    raise AnalysisError(
+        f"{what} is {_short(given)}, but a name or a list of names is expected: write for "
+        f'instance {what}="{example}".'
+    )
 
 
 def _conditions(given: object) -> Mapping[str, object]:
     if isinstance(given, Mapping) and all(isinstance(path, str) for path in given):
         return given
-    texts = given if isinstance(given, list) else [given]
-    read = [read_condition(text) for text in texts if isinstance(text, str)]
-    meant = dict(condition for condition in read if condition) or {"model.width": 32}
     raise AnalysisError(
         f"where is {_short(given)}, but a mapping of dotted paths to values is expected: "
-        f"write for instance where={meant!r}."
+        f"write for instance where={{'model.width': 32}}."
     )
 
 

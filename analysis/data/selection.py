@@ -22,13 +22,10 @@ from analysis.data.matching import (
 )
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES, TITLES
-from dopt.spec.config import labels, limits_label, value_label
+from dopt.spec.config import SECTIONS, labels, limits_label, value_label
 from dopt.spec.trial import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS
 from orchestrate.store import FINISHED, ConfigRow, Reader, TrialRow
-
-Compatible = Callable[[ConfigRow, ConfigRow], bool]
-_SECTIONS = ("env", "policy", "model", "learner")
 
 ENVIRONMENTS = (
     *("pendulum", "cartpole", "arm", "quadrotor"),
@@ -70,13 +67,11 @@ def ranges(seeds: Iterable[int]) -> str:
 
 def is_possible(policy: ConfigRow, environment: ConfigRow) -> bool:
     """Return True if a policy's configuration makes sense with another environment's section."""
-    config = {key: value for key, value in policy.config.items() if key in _SECTIONS}
+    config = {key: value for key, value in policy.config.items() if key in SECTIONS}
     try:
         stored_trial({**config, "env": environment.config["env"]})
-    except IncompatibleError:
-        return False
-    except SpecificationError:
-        return True
+    except SpecificationError as error:
+        return not isinstance(error, IncompatibleError)
     return True
 
 
@@ -91,9 +86,7 @@ def why_impossible(env: str, policy: str) -> str | None:
     return None
 
 
-def absent_pairs(
-    configs: Sequence[ConfigRow], compatible: Compatible = is_possible
-) -> list[tuple[str, str]]:
+def absent_pairs(configs: Sequence[ConfigRow]) -> list[tuple[str, str]]:
     """Return the (environment, policy) pairs of which nothing is stored though they make sense.
 
     Nothing is expected of explorations.
@@ -106,7 +99,7 @@ def absent_pairs(
         (env, policy)
         for env in environments
         for policy in policies
-        if (env, policy) not in stored and compatible(policies[policy], environments[env])
+        if (env, policy) not in stored and is_possible(policies[policy], environments[env])
     ]
 
 
@@ -142,6 +135,15 @@ class Entry:
     @property
     def finished(self) -> tuple[TrialRow, ...]:
         return tuple(trial for trial in self.trials if trial.status in FINISHED)
+
+    @property
+    def n_diverged(self) -> int:
+        return sum(trial.status == "diverged" for trial in self.trials)
+
+    def describe(self, used: int) -> str:
+        """Return how many finished trials are in a statistic, such as ``98/100, 2 diverged``."""
+        lost = self.n_diverged
+        return f"{used}/{len(self.finished)}, {lost} diverged" if lost else str(used)
 
     def final_losses(self) -> dict[int, float]:
         """Return the final loss by seed of the trials that did not diverge."""
@@ -179,15 +181,15 @@ class Selection:
         """Return the part about some environments and policies; no policies means all."""
         envs, names = set(environments), set(policies)
 
-        def kept(env: str, policy: str) -> bool:
-            return env in envs and (not names or policy in names)
+        def kept(one: ConfigRow | Gap) -> bool:
+            return one.env in envs and (not names or one.policy in names)
 
-        return replace(
-            self,
-            entries=tuple(e for e in self.entries if kept(e.config.env, e.config.policy)),
-            gaps=tuple(gap for gap in self.gaps if kept(gap.env, gap.policy)),
-            stored=tuple(e for e in self.stored if kept(e.config.env, e.config.policy)),
-        )
+        gaps = tuple(gap for gap in self.gaps if kept(gap))
+        return replace(self._where(lambda one: kept(one.config)), gaps=gaps)
+
+    def _where(self, kept: Callable[[Entry], bool]) -> Selection:
+        entries, stored = tuple(filter(kept, self.entries)), tuple(filter(kept, self.stored))
+        return replace(self, entries=entries, stored=stored)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -214,11 +216,7 @@ class Selection:
 
     def simulated(self) -> Selection:
         """Return the part without explorations, whose losses are errors along their own paths."""
-        entries, stored = (
-            tuple(one for one in part if not is_prequential(one.config.config))
-            for part in (self.entries, self.stored)
-        )
-        return replace(self, entries=entries, stored=stored)
+        return self._where(lambda one: not is_prequential(one.config.config))
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the selected trials, their outcome and what is missing."""
@@ -244,7 +242,7 @@ def environment_rank(environment: str) -> tuple[int, str]:
     return (ENVIRONMENTS.index(environment) if known else len(ENVIRONMENTS), environment)
 
 
-def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible) -> Selection:
+def select(reader: Reader, wanted: Filter) -> Selection:
     """Return the trials that stand for each environment and policy.
 
     Raises
@@ -267,7 +265,7 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     )
     return Selection(
         entries,
-        tuple(_gaps(entries, compatible if by_policy else None)),
+        tuple(_gaps(entries, by_policy=by_policy)),
         (*omissions(stored, chosen), *source_notes(current, chosen)),
         tuple(labelled(Entry(config, trials[config.config_key]) for config in stored)),
         wanted.reference,
@@ -316,8 +314,8 @@ def _group_rank(entry: Entry, group_by: Sequence[str]) -> list[tuple[float, int,
     return ranks
 
 
-def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable[Gap]:
-    """Yield what entries lack; policies without any trial where it is known which are possible."""
+def _gaps(entries: tuple[Entry, ...], *, by_policy: bool) -> Iterable[Gap]:
+    """Yield what entries lack, with ``by_policy`` also possible policies without any trial."""
     seeds: dict[str, set[int]] = {}
     for entry in entries:
         seeds.setdefault(entry.config.env, set()).update(trial.seed for trial in entry.trials)
@@ -331,9 +329,7 @@ def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable
             states = Counter(state.get(seed, "not registered") for seed in missing)
             text = ", ".join(f"{count} {name}" for name, count in sorted(states.items()))
             yield Gap(entry.config.env, entry.config.policy, tuple(sorted(missing)), text)
-    if compatible is None:
-        return
-    for env, policy in absent_pairs([entry.config for entry in entries], compatible):
+    for env, policy in absent_pairs([entry.config for entry in entries]) if by_policy else ():
         expected = seeds[env]
         yield Gap(env, policy, tuple(sorted(expected)), f"{len(expected)} not registered")
 

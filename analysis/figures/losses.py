@@ -65,7 +65,7 @@ from analysis.stats.curves import (
     measure_curves,
     tabulate_curves,
 )
-from analysis.stats.scores import final_losses, on_front
+from analysis.stats.scores import final_losses, on_front, values_of
 from analysis.style import (
     BLACK,
     GREY,
@@ -149,7 +149,7 @@ def _curves_panel(
         _lines(axes[0], curves, parts.upper, spread)
         _lines(axes[1], curves, parts.lower, spread)
         mark_break(*axes)
-    counts = {curve.label: curve.sample.describe() for curve in curves}
+    counts = {curve.label: curve.count for curve in curves}
     text = "; no ".join([count_text(counts), *map(policy_title, absent)])
     axes[0].set_title(_title(environment_title(curves[0].env), f"({text})"))
     return axes
@@ -224,7 +224,7 @@ def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> lis
     handles: list[Artist] = [
         Line2D([], [], label=label, **look(style)) for label, style in styles.items()
     ]
-    name = options.interval
+    name = options.statistic.band
     if options.spread is Spread.BAND:
         return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=name)]
     return [*handles, Line2D([], [], ls="none", marker="|", ms=9, mew=1, color=GREY, label=name)]
@@ -235,7 +235,7 @@ def curves_caption(numbers: Curves) -> str:
     column, options, curves = numbers
     counts = [
         f"{environment_title(env)} "
-        + count_text({c.label: c.sample.describe() for c in curves if c.env == env})
+        + count_text({c.label: c.count for c in curves if c.env == env})
         for env in dict.fromkeys(c.env for c in curves)
     ]
     envs = dict.fromkeys(curve.env for curve in curves)
@@ -243,7 +243,7 @@ def curves_caption(numbers: Curves) -> str:
     return (
         f"{_what(column, curves)} against time t, one panel per environment. "
         f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
-        f"{options.interval}; no smoothing. {_breaks(curves)}"
+        f"{options.statistic.band}; no smoothing. {_breaks(curves)}"
         f"A diverged trial leaves its whole curve. Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )
@@ -306,7 +306,7 @@ def measure_points(reader: Reader, selection: Selection) -> pd.DataFrame:
     rows = []
     for entry, learner in zip(selection.entries, learners, strict=True):
         scores = final_losses(reader, entry, "loss")
-        system, loss = system_of(entry.config.config), geometric_mean(scores.values)
+        system, loss = system_of(entry.config.config), geometric_mean(values_of(scores))
         row: dict[str, Any] = {
             "env": entry.config.env,
             "label": entry.label,
@@ -315,8 +315,8 @@ def measure_points(reader: Reader, selection: Selection) -> pd.DataFrame:
         row |= {"policy_label": policies[section_text(entry, "policy")], "learner_label": learner}
         row |= {"us_per_step": step_us(reader, entry)}
         row |= {"loss": loss.value, "low": loss.low, "high": loss.high, "unit": loss_unit(system)}
-        row |= {"n": len(scores.by_seed), "n_diverged": scores.n_diverged}
-        rows.append(row | {"counts": scores.describe(), "limit_us": 1e6 * system.dt})
+        row |= {"n": len(scores), "n_diverged": entry.n_diverged}
+        rows.append(row | {"counts": entry.describe(len(scores)), "limit_us": 1e6 * system.dt})
     table = pd.DataFrame(rows)
     costs = table[["us_per_step", "loss"]]
     front = np.zeros(len(table), dtype=bool)
@@ -371,11 +371,6 @@ def policies_of(points: pd.DataFrame) -> dict[str, str]:
     """Return the words of the policies with their names, in the order of the titles."""
     found = dict(zip(points["policy_label"], points["policy"], strict=True))
     return dict(sorted(found.items(), key=lambda one: (policy_rank(one[1]), len(one[0]), one[0])))
-
-
-def tabulate_points(points: pd.DataFrame) -> pd.DataFrame:
-    """Return what is drawn, one row for each environment and configuration."""
-    return points.drop(columns=["unit", "counts", "limit_us", "known"])
 
 
 def draw(points: pd.DataFrame) -> Figure:
@@ -506,7 +501,7 @@ PARETO: Plot[pd.DataFrame] = Plot(
     band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
     part=lambda selection, _: pareto_part(selection),
     measure=lambda reader, selection, _: measure_points(reader, selection),
-    tabulate=tabulate_points,
+    tabulate=lambda points: points.drop(columns=["unit", "counts", "limit_us", "known"]),
     draw=draw,
     caption=caption,
 )

@@ -123,7 +123,7 @@ class Plot(Generic[N]):
 
     def words(self, options: PlotOptions) -> dict[str, str]:
         """Return the title, the statistic and the band of some options, for the provenance."""
-        names = {"centre": options.statistic.label, "interval": options.interval}
+        names = {"centre": options.statistic.label, "interval": options.statistic.band}
         return {
             "title": self.title,
             "statistic": self.statistic.format(**names),

@@ -35,7 +35,7 @@ from analysis.figures.panels import (
 from analysis.stats.curves import (
     DrawnPlane,
     average_spectrum,
-    mean,
+    centre,
     median_seed,
     standard_error,
 )
@@ -136,7 +136,7 @@ def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Por
         line=plane.line(points) if len(points) else points,
         start=plane.wrapped(points[:1])[0] if len(points) else np.full(2, np.nan),
         diverged=status.get(seed) == "diverged",
-        coverage=float(mean(shares)),
+        coverage=float(centre(shares)),
         coverage_error=float(standard_error(shares)),
         n=len(shares),
         n_diverged=len(finished) - len(shares),
@@ -211,24 +211,16 @@ def _panel(axes: Axes, portrait: Portrait, plane: DrawnPlane) -> None:
     style = policy_style(portrait.policy)
     axes.plot(portrait.line[:, 0], portrait.line[:, 1], color=style.colour, lw=0.7, zorder=2)
     axes.plot(*portrait.start, marker="o", ms=4, mfc="white", mec=BLACK, mew=1, zorder=3)
+    n = but_diverged(portrait.n, portrait.n_diverged)
+    covered = percent_text(portrait.coverage, portrait.coverage_error, portrait.n)
     axes.set_title(
-        f"{style.label}\n{coverage_text(portrait)} ({_trials_text(portrait)})", fontsize=7.5
+        f"{style.label}\ncoverage {covered or 'unknown'} (n = {n})",
+        fontsize=7.5,
     )
     if not len(portrait.line):
         axes.text(0.5, 0.5, "no finished trial", transform=axes.transAxes, ha="center")
     elif portrait.diverged:
         axes.text(0.06, 0.07, "this trial diverged", transform=axes.transAxes, fontsize=6.5)
-
-
-def _trials_text(portrait: Portrait) -> str:
-    """Return the number of trials behind the coverage."""
-    return f"n = {but_diverged(portrait.n, portrait.n_diverged)}"
-
-
-def coverage_text(portrait: Portrait) -> str:
-    """Return the mean coverage in per cent ± 2 standard errors."""
-    text = percent_text(portrait.coverage, portrait.coverage_error, portrait.n)
-    return f"coverage {text or 'unknown'}"
 
 
 def _set_axes(axes: Axes, portraits: Portraits) -> None:

@@ -85,32 +85,26 @@ def draw_fit(found: Fitted, log: Log, target: Path) -> None:
         Run whose longest piece is shown.
     target : Path
     """
-    names = _names(found)
+    from dopt.fitting.model import measured_names  # loads numba
+
+    names = list(measured_names(found.plant))
     with styled():
         figure = Figure((TEXT_WIDTH, 1.0 + 1.6 * len(names)), layout="constrained")
         panels = figure.subplots(len(names), 2, squeeze=False, width_ratios=(3, 2))
-        _run(found, log, panels[:, 0])
-        _errors(found, panels[:, 1])
+        _run(found, log, names, panels[:, 0])
+        _errors(found, names, panels[:, 1])
         legend_below(figure, 5)
         target.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(target)
 
 
-def _names(found: Fitted) -> list[str]:
-    """Return the measured states in the order of their columns."""
-    from dopt.fitting.model import measured_names  # loads numba
-
-    return list(measured_names(found.plant))
-
-
-def _run(found: Fitted, log: Log, panels: np.ndarray) -> None:
+def _run(found: Fitted, log: Log, measured: list[str], panels: np.ndarray) -> None:
     longest = max(range(len(log.pieces)), key=lambda i: len(log.pieces[i].time))
     piece = log.pieces[longest]
     simulated = max(found.simulate(log), key=lambda each: len(each.time))
     begin = simulated.time[0]
     end = begin + SHOWN * found.selection.window
     part, seen = simulated.time <= end, (piece.time >= begin) & (piece.time <= end)
-    measured = _names(found)
     states = [list(found.plant.states).index(name) for name in measured]
     for c, (name, axes) in enumerate(zip(measured, panels, strict=True)):
         column = piece.measured[seen, log.states.index(name)]
@@ -124,9 +118,9 @@ def _run(found: Fitted, log: Log, panels: np.ndarray) -> None:
     panels[0].set(title="free run, bounds of 90 %")
 
 
-def _errors(found: Fitted, panels: np.ndarray) -> None:
+def _errors(found: Fitted, measured: list[str], panels: np.ndarray) -> None:
     rows = found.errors()
-    for name, axes in zip(_names(found), panels, strict=True):
+    for name, axes in zip(measured, panels, strict=True):
         own = [row for row in rows if row["state"] == name]
         for what in ("model", "physics alone", "linear"):
             here = [row for row in own if row["model"] == what]

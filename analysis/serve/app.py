@@ -38,10 +38,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from analysis.serve import is_loopback, pages, sql
 from analysis.serve.web import (
     FOLDER,
-    BusyError,
     Database,
-    ForbiddenError,
-    NotFoundError,
     QueryParams,
     RequestError,
     ServerState,
@@ -72,13 +69,8 @@ DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/trials/{trial_key}", pages.trial),
     ("/api/trials/{trial_key}/arrays", pages.arrays),
 )
-STATES = (
-    ((NoDatabaseError, SchemaVersionError, StoreUnavailableError), 503),
-    ((BusyError,), 429),
-    ((NotFoundError,), 404),
-    ((ForbiddenError,), 403),
-    ((DoptError,), 400),
-)
+UNAVAILABLE = (NoDatabaseError, SchemaVersionError, StoreUnavailableError)
+"""Errors of a database that may be there later."""
 
 
 def create_app(url: str, host: str = "127.0.0.1") -> Starlette:
@@ -180,7 +172,7 @@ def _curves_table(state: ServerState, request: Request) -> Response:
 
 def _error_response(state: ServerState, request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
-        status = next(code for kinds, code in STATES if isinstance(error, kinds))
+        status = getattr(error, "status", 503 if isinstance(error, UNAVAILABLE) else 400)
         return _message(state, request, status, str(error).replace("--where", "the field Where"))
     missing = "This page does not exist: choose a page from the menu above."
     sentence = missing if error.status_code == 404 else f"{error.detail}."

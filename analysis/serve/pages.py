@@ -16,7 +16,7 @@ import pandas as pd
 from analysis.data.matching import AnalysisError, latest
 from analysis.data.samples import bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
-from analysis.serve.web import NotFoundError, QueryParams, ServerState, read_progress, truncated
+from analysis.serve.web import QueryParams, RequestError, ServerState, read_progress, truncated
 from analysis.stats.curves import (
     Axis,
     DrawnPlane,
@@ -331,15 +331,11 @@ def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple
     column = params.choice("column", LOSSES, "loss")
     options = PlotOptions(params.member("x", Axis, Axis.STEPS))
 
-    def measured(part: Selection) -> LossCurve:
-        """Return a curve without the values of its trials, which the pages do not show."""
-        curve = measure_curves(reader, part, column, options)[0]
-        values = curve.sample.values[:, :0].copy()
-        return replace(curve, sample=replace(curve.sample, values=values))
-
     def cached(part: Selection) -> LossCurve:
         key = ("curve", reader, part.fingerprint(), column, options)
-        return state.cache.get_or_compute(key, lambda: measured(part))
+        return state.cache.get_or_compute(
+            key, lambda: measure_curves(reader, part, column, options)[0]
+        )
 
     parts = [replace(selection, entries=(entry,), gaps=()) for entry in selection.entries]
     return selection, tuple(cached(part) for part in parts)
@@ -351,7 +347,7 @@ def _curve(curve: LossCurve) -> Content:
     if curve.is_prequential:  # of one step it is noise
         running = pd.Series(band.centre).rolling(WINDOW, min_periods=1, center=True).median()
         values = {"values": running.to_numpy(), "points": band.centre}
-    return legend_entry(curve.policy) | values | {"count": curve.sample.describe()}
+    return legend_entry(curve.policy) | values | {"count": curve.count}
 
 
 def trials(state: ServerState, params: QueryParams) -> Content:
@@ -431,8 +427,8 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
     try:
         trajectory = reader.trajectory(row["config_key"], row["seed"])
     except QueryError as error:
-        raise NotFoundError(
-            f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it."
+        raise RequestError(
+            f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it.", 404
         ) from error
     config = json.loads(row["config_json"])
     system = _system(config)
@@ -495,9 +491,10 @@ def _row(reader: Reader, params: QueryParams) -> Content:
     key = params.text("trial_key")
     found = reader.rows(_TRIAL, trial_key=key)
     if not found:
-        raise NotFoundError(
+        raise RequestError(
             f"There is no trial '{truncated(key, 20)}' in {reader.safe_url}: "
-            f"choose one of the trials page."
+            f"choose one of the trials page.",
+            404,
         )
     return dict(zip(found.columns, found[0], strict=True))
 

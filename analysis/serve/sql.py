@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from analysis.serve.web import BusyError, ForbiddenError, QueryParams, ServerState
+from analysis.serve.web import QueryParams, RequestError, ServerState
 from orchestrate.store import READ_VARIABLE, QueryError, Table
 
 MAX_ROWS = 1000
@@ -140,10 +140,10 @@ def _access(state: ServerState) -> tuple[bool, str]:
 
 def _run_query(state: ServerState, params: QueryParams, rows: int, stopped: Stopped) -> Table:
     if not secrets.compare_digest(params.text("token").encode(), state.token.encode()):
-        raise ForbiddenError("The form is not one of this server: open the page SQL again.")
+        raise RequestError("The form is not one of this server: open the page SQL again.", 403)
     allowed, sentence = _access(state)
     if not allowed:
-        raise ForbiddenError(sentence)
+        raise RequestError(sentence, 403)
     with _slot(stopped):
         return state.database.reader().query(
             params.text("q"), rows, TIMEOUT_SECONDS, state.database.read_login, stopped
@@ -155,8 +155,8 @@ def _slot(stopped: Stopped) -> Iterator[None]:
     end = time.monotonic() + TIMEOUT_SECONDS
     while not _slots.acquire(timeout=0.1):
         if stopped() or time.monotonic() > end:
-            raise BusyError(
-                f"{MAX_CONCURRENT} queries are running: wait until one ends, then try again."
+            raise RequestError(
+                f"{MAX_CONCURRENT} queries are running: wait until one ends, then try again.", 429
             )
     try:
         yield

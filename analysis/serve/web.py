@@ -41,19 +41,11 @@ LARGEST = 2**31 - 1
 
 
 class RequestError(AnalysisError):
-    """A query parameter has an invalid value."""
+    """A request that is not answered, with its HTTP status: 400 for an invalid parameter."""
 
-
-class NotFoundError(AnalysisError):
-    """The trial does not exist."""
-
-
-class ForbiddenError(AnalysisError):
-    """The request comes from another site, or needs a right that is not given."""
-
-
-class BusyError(AnalysisError):
-    """Too many queries are running."""
+    def __init__(self, sentence: str, status: int = 400) -> None:
+        super().__init__(sentence)
+        self.status = status
 
 
 class QueryParams:
@@ -98,21 +90,11 @@ class QueryParams:
 
     def filter(self, environment: str) -> Filter:
         """Return the filter of an environment's configurations with ``where`` and ``width``."""
-        conditions = dict(_condition(word) for word in self.text("where").split())
+        conditions = dict(map(read_condition, self.text("where").split()))
         width = self.integer("width", low=1)
         if width is not None:
             conditions["model.width"] = width
         return Filter((environment,), (), conditions)
-
-
-def _condition(word: str) -> tuple[str, object]:
-    found = read_condition(word)
-    if found is None:
-        raise RequestError(
-            f"'where' holds '{truncated(word)}', conditions PATH=VALUE are expected: "
-            f"write for instance policy.form=dual."
-        )
-    return found
 
 
 def truncated(text: str, length: int = 60) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 from analysis.data.samples import read_sample
 from analysis.data.selection import Entry
 from analysis.stats.curves import CONFIDENCE, band, interval_of_mean
-from analysis.style import of_finished
 from dopt.types import Array, Booleans
 from orchestrate.store import Assessments, Reader
 
@@ -35,35 +34,23 @@ class Measure(StrEnum):
     STEPS = "steps"
 
 
-@dataclass(frozen=True)
-class Scores:
-    """One number for each seed of an entry whose trial did not diverge, and counts."""
-
-    env: str
-    policy: str
-    label: str
-    by_seed: Mapping[int, float]
-    n_finished: int
-    n_diverged: int
-
-    @property
-    def values(self) -> Array:
-        """The numbers (n,), by seed."""
-        return np.array([self.by_seed[seed] for seed in sorted(self.by_seed)], dtype=float)
-
-    def describe(self) -> str:
-        """Return the count to print, such as ``98/100, 2 diverged``."""
-        return of_finished(len(self.by_seed), self.n_finished, self.n_diverged)
+BySeed = Mapping[int, float]
+"""One number for each seed of an entry whose trial did not diverge."""
 
 
-def final_losses(reader: Reader, entry: Entry, column: str) -> Scores:
+def values_of(scores: BySeed) -> Array:
+    """Return the numbers (n,), by rising seed."""
+    return np.array([scores[seed] for seed in sorted(scores)], dtype=float)
+
+
+def final_losses(reader: Reader, entry: Entry, column: str) -> BySeed:
     """Return the loss after the last step of each trial; from the summary column where it is."""
     if column != "loss":
         return _scores(reader, entry, column, lambda values: values[:, -1])
-    return _counted(entry, entry.final_losses())
+    return entry.final_losses()
 
 
-def mean_losses(reader: Reader, entry: Entry, column: str) -> Scores:
+def mean_losses(reader: Reader, entry: Entry, column: str) -> BySeed:
     """Return the geometric mean of the loss over all steps of each trial."""
     return _scores(reader, entry, column, mean_over_steps)
 
@@ -94,7 +81,7 @@ def steps_to(
     column: str,
     threshold: float,
     passage: Callable[[Array, float], Array] = first_passage,
-) -> Scores:
+) -> BySeed:
     """Return the steps until the loss is at most the threshold, inf where it never is.
 
     By default for the first time (:func:`first_passage`).
@@ -114,16 +101,9 @@ def _scores(
     entry: Entry,
     column: str,
     score: Callable[[Array], Array],
-) -> Scores:
+) -> BySeed:
     sample = read_sample(reader, entry, column)
-    scores = score(sample.values).tolist()
-    return _counted(entry, dict(zip(sample.seeds.tolist(), scores, strict=True)))
-
-
-def _counted(entry: Entry, by_seed: Mapping[int, float]) -> Scores:
-    diverged = sum(trial.status == "diverged" for trial in entry.trials)
-    names = entry.config.env, entry.config.policy, entry.label
-    return Scores(*names, by_seed, len(entry.finished), diverged)
+    return dict(zip(sample.seeds.tolist(), score(sample.values).tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -390,7 +370,7 @@ def geometric_mean(ratios: Array) -> Interval:
     return centre, low, high
 
 
-def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
+def scores_at(reader: Reader, entry: Entry, t: int) -> BySeed:
     """Return the relative cost of each trial that reached t explored steps.
 
     As in :func:`relative_costs` a lost episode has inf, and NaN where the true model's was lost.
@@ -402,6 +382,4 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
     at = costs.t == t
     seeds = costs.seeds[reached[:, at].any(axis=1)]
     column = costs.values[reached & at]
-    by_seed = dict(zip(seeds.tolist(), column.tolist(), strict=True))
-    names = entry.config.env, entry.config.policy, entry.label
-    return Scores(*names, by_seed, len(costs.seeds), int(np.sum(costs.diverged)))
+    return dict(zip(seeds.tolist(), column.tolist(), strict=True))

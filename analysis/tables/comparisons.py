@@ -22,21 +22,21 @@ from analysis.data.samples import sample_losses
 from analysis.data.selection import Entry, Selection
 from analysis.stats.curves import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
+    BySeed,
     Comparison,
     Measure,
-    Scores,
     benjamini_hochberg,
     compare,
     compare_hitting_times,
     final_losses,
     mean_losses,
     steps_to,
+    values_of,
 )
 from dopt.types import Array
 from orchestrate.store import Reader
 
-BySeed = Mapping[int, float]
-Score = Callable[[Reader, Entry, str], Scores]
+Score = Callable[[Reader, Entry, str], BySeed]
 
 Judged = Mapping[str, object]
 """Columns that compare a variant with its reference."""
@@ -46,7 +46,8 @@ EPSILON_POLICY = "random"
 
 _SCORES: dict[Measure, Score] = {Measure.FINAL: final_losses, Measure.AUC: mean_losses}
 _ENDS = {"ratio": "centre", "low": "low", "high": "high"}
-ScoredPair = tuple[Scores, Scores]
+Ratios = tuple[Entry, Entry, Array]
+"""A variant, its reference, and the logarithms of the ratios on the seeds that they share."""
 
 
 def against_reference(
@@ -82,9 +83,13 @@ def compare_policies(
     name = "auc" if measure is Measure.AUC else column
     rows: list[dict[str, object]] = []
     selection = selection.simulated()
+
+    def judge(own: BySeed, other: BySeed, env: str, variant: str) -> Judged:
+        return asdict(against_reference(own, other, env, variant, name))
+
     for env in selection.environments:
         scores = [_SCORES[measure](reader, entry, column) for entry in selection.of(env)]
-        rows += _rows(selection, env, scores, lambda own, other: asdict(_against(own, other, name)))
+        rows += _rows(selection, env, scores, judge)
     return _adjusted(rows, selection)
 
 
@@ -137,7 +142,7 @@ def loss_of_random_inputs(reader: Reader, entries: Iterable[Entry], column: str)
     if not found:
         return None
     usual = max(found, key=lambda one: nearness(one.config))
-    return float(np.median(final_losses(reader, usual, column).values))
+    return float(np.median(values_of(final_losses(reader, usual, column))))
 
 
 def references(selection: Selection, env: str) -> Iterator[tuple[Entry, Entry, bool]]:
@@ -182,28 +187,27 @@ def _group(entry: Entry, selection: Selection) -> tuple[object, ...]:
 def _rows(
     selection: Selection,
     env: str,
-    scores: Sequence[Scores],
-    judge: Callable[[Scores, Scores], Judged],
+    scores: Sequence[BySeed],
+    judge: Callable[[BySeed, BySeed, str, str], Judged],
 ) -> Iterator[dict[str, object]]:
-    """Yield a row for each variant of an environment: names, what ``judge`` says, and counts."""
-    found = {one.label: one for one in scores}
+    """Yield a row for each variant of an environment: names, what ``judge`` says, and counts.
+
+    It is given the scores of the variant and of its reference, the environment and the label.
+    """
+    labels = (entry.label for entry in selection.of(env))
+    found = dict(zip(labels, scores, strict=True))
     keys = _other_keys(selection)
     for entry, other, same_group in references(selection, env):
-        own, reference = found[entry.label], found[other.label]
-        names = {"env": env, "policy": own.policy, "variant": own.label}
-        names["reference"] = reference.label
+        names = {"env": env, "policy": entry.config.policy, "variant": entry.label}
+        names["reference"] = other.label
         if keys:
             names["same"] = ", ".join(keys) if same_group else ""
-        diverged = own.n_diverged + reference.n_diverged
-        yield {**names, **judge(own, reference), "n_diverged": diverged}
+        judged = judge(found[entry.label], found[other.label], env, entry.label)
+        yield {**names, **judged, "n_diverged": entry.n_diverged + other.n_diverged}
 
 
-def _against(own: Scores, reference: Scores, measure: str) -> Comparison:
-    return against_reference(own.by_seed, reference.by_seed, own.env, own.label, measure)
-
-
-def _race(facts: Judged, own: Scores, reference: Scores) -> Judged:
-    return {**facts, **asdict(compare_hitting_times(*paired(own.by_seed, reference.by_seed)))}
+def _race(facts: Judged, own: BySeed, reference: BySeed, *_: str) -> Judged:
+    return {**facts, **asdict(compare_hitting_times(*paired(own, reference)))}
 
 
 def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFrame:
@@ -236,34 +240,34 @@ def aggregate(reader: Reader, selection: Selection) -> pd.DataFrame:
     AnalysisError
         If the reference shares no seed with another variant.
     """
-    found: dict[str, list[ScoredPair]] = {}
+    found: dict[str, list[Ratios]] = {}
     selection = selection.simulated()
     for env in selection.environments:
         for own, reference, _ in references(selection, env):
-            ours, theirs = (final_losses(reader, one, "loss") for one in (own, reference))
-            if set(ours.by_seed) & set(theirs.by_seed):
-                found.setdefault(own.label, []).append((ours, theirs))
+            logs = _log_ratios(*(final_losses(reader, one, "loss") for one in (own, reference)))
+            if len(logs):
+                found.setdefault(own.label, []).append((own, reference, logs))
     if not found:
         raise nothing_to_compare(selection)
     return pd.DataFrame([_aggregate_row(variant, pairs) for variant, pairs in found.items()])
 
 
-def _aggregate_row(variant: str, pairs: list[ScoredPair]) -> dict[str, object]:
-    logs = [_log_ratios(own, reference) for own, reference in pairs]
+def _aggregate_row(variant: str, pairs: list[Ratios]) -> dict[str, object]:
+    logs = [ratios for *_, ratios in pairs]
     found = stratified_mean(logs)
     return {
         "variant": variant,
         "reference": pairs[0][1].label,
-        "systems": ", ".join(own.env for own, _ in pairs),
+        "systems": ", ".join(own.config.env for own, *_ in pairs),
         **{name: float(np.exp(getattr(found, part))) for name, part in _ENDS.items()},
         "n_pairs": sum(map(len, logs)),
-        "n_diverged": sum(own.n_diverged + reference.n_diverged for own, reference in pairs),
+        "n_diverged": sum(own.n_diverged + reference.n_diverged for own, reference, _ in pairs),
     }
 
 
-def _log_ratios(own: Scores, reference: Scores) -> Array:
+def _log_ratios(own: BySeed, reference: BySeed) -> Array:
     """Return the logarithms of the ratios (n,); NaN for a loss that has none."""
-    ours, theirs = paired(own.by_seed, reference.by_seed)
+    ours, theirs = paired(own, reference)
     with np.errstate(divide="ignore", invalid="ignore"):
         logs: Array = np.log(ours / theirs)
     return np.where(np.isfinite(logs), logs, np.nan)
@@ -283,10 +287,10 @@ def _summary(reader: Reader, entry: Entry) -> dict[str, object]:
     row: dict[str, object] = {"env": entry.config.env, "policy": entry.config.policy}
     row["label"] = entry.label
     for name, found in scores.items():
-        row |= mean_columns(name, found.values)
-        row[f"{name}_median"] = float(centre(found.values, Statistic.MEDIAN))
-        row[f"{name}_iqm"] = float(centre(found.values, Statistic.IQM))
+        values = values_of(found)
+        row |= mean_columns(name, values)
+        row[f"{name}_median"] = float(centre(values, Statistic.MEDIAN))
+        row[f"{name}_iqm"] = float(centre(values, Statistic.IQM))
     if sampled := sample_losses(reader, entry):
         row |= mean_columns("sample_loss", np.array([*sampled.values()]))
-    grid = scores["loss"]
-    return row | {"n": len(grid.by_seed), "n_diverged": grid.n_diverged}
+    return row | {"n": len(scores["loss"]), "n_diverged": entry.n_diverged}

@@ -40,11 +40,8 @@ from dopt.offline_fit import HeldOutFit, held_out_fit, sample_loss
 from dopt.result import Assessment
 from orchestrate.store import QueryError, Reader
 
-_ESCAPED = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_ESCAPED |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
-_ESCAPED |= {"<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}"}
-_ESCAPED |= {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
-_ESCAPED |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
+_IN_LATEX = {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
+_IN_LATEX |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
 
 _SIGNS = str.maketrans({"±": "+-", "×": "x", "≤": "<=", "≥": ">=", "–": "-", "−": "-", "‖": "|"})
 """Signs whose names say nothing by their last word, as ASCII."""
@@ -76,24 +73,18 @@ class TextTable:
     def latex(self) -> str:
         """Return a whole ``tabular`` that needs no package, the note as comments above it.
 
-        Everything is ASCII, so that it compiles with every engine.
+        Everything is ASCII, signs and Greek letters are commands: it compiles with every engine.
         """
-        cells = [[_latex_text(text) for text in row] for row in (self.headers, *self.rows)]
-        lines = [" & ".join(row) + r" \\" for row in cells]
         note = "".join(f"% {_ascii(line)}\n" for line in self.note.splitlines())
-        begin = rf"\begin{{tabular}}{{{'l' * len(self.headers)}}}"
-        parts = [begin, r"\hline", lines[0], r"\hline", *lines[1:], r"\hline", r"\end{tabular}"]
-        return note + "\n".join(parts) + "\n"
-
-
-def _latex_text(text: object) -> str:
-    """Return a text as LaTeX: special letters escaped, signs and Greek letters as commands."""
-    return "".join(_latex_letter(letter) for letter in str(text))
+        table = tabulate(self.rows, headers=self.headers, tablefmt="latex", disable_numparse=True)
+        return note + "".join(map(_latex_letter, table)) + "\n"
 
 
 def _latex_letter(letter: str) -> str:
-    if letter in _ESCAPED:
-        return _ESCAPED[letter]
+    if letter.isascii():
+        return letter
+    if letter in _IN_LATEX:
+        return _IN_LATEX[letter]
     name = unicodedata.name(letter, "")
     if name.startswith("GREEK SMALL LETTER "):
         return rf"$\{name.rpartition(' ')[2].lower().replace('lamda', 'lambda')}$"
@@ -254,17 +245,13 @@ def _reference(table: pd.DataFrame) -> str:
     return f"reference (same {keys}{', if stored' if '' in set(table['same']) else ''})"
 
 
-def gaps_table(gaps: Iterable[Gap]) -> TextTable:
-    """Return the table of what is missing."""
-    rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
-    return TextTable(["env", "policy", "missing", "state", "seeds"], rows)
-
-
 def incomplete(gaps: Sequence[Gap], wanted: str, options: str) -> IncompleteError:
     """Return the error for trials that are missing; ``options`` narrow the request."""
     missing = sum(len(gap.seeds) for gap in gaps)
+    rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
+    table = TextTable(["env", "policy", "missing", "state", "seeds"], rows)
     return IncompleteError(
-        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, {wanted} "
+        f"{table.markdown()}\n\nerror: {missing} trials are missing, {wanted} "
         f"expected: run the launch again, narrow the request by {options}, "
         f"or give --allow-partial to go on with what there is."
     )

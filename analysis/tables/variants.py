@@ -20,7 +20,6 @@ from analysis.data.matching import (
     AnalysisError,
     Filter,
     accepted,
-    difference,
     latest_sources,
     nearness,
 )
@@ -34,8 +33,9 @@ from analysis.data.selection import (
     policy_rank,
     section_text,
 )
-from analysis.stats.curves import mean, mean_columns
+from analysis.stats.curves import centre, mean_columns
 from analysis.stats.scores import (
+    BySeed,
     benjamini_hochberg,
     censored_median,
     common_task,
@@ -56,9 +56,10 @@ from analysis.stats.scores import (
     without_ratio,
 )
 from analysis.style import but_diverged
-from analysis.tables.comparisons import BySeed, against_reference, loss_of_random_inputs, paired
+from analysis.tables.comparisons import against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
 from dopt.policies import policy_title
+from dopt.spec.config import difference
 from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Assessments, Reader
 
@@ -163,7 +164,8 @@ def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | No
     references = [entry for entry in kept if entry.config.policy == policy]
     if not references or len(kept) < 2:
         return None
-    reference = max(references, key=lambda entry: (_company(entry, kept), *nearness(entry.config)))
+    company = Counter(map(_setting, kept))
+    reference = max(references, key=lambda one: (company[_setting(one)], *nearness(one.config)))
     words = labels_of(entry.config for entry in kept)
     variants = [replace(entry, label=label) for entry, label in zip(kept, words, strict=True)]
     first = next(one for one in variants if one.config is reference.config)
@@ -200,14 +202,8 @@ def _of_other_tasks(variants: Sequence[Entry], task: str | None) -> Iterator[str
         )
 
 
-def _company(entry: Entry, entries: Sequence[Entry]) -> int:
-    """Return how many entries share the model, the learner and the limits of this one."""
-    own = _setting(entry)
-    return sum(_setting(one) == own for one in entries)
-
-
-def _setting(entry: Entry) -> list[str]:
-    return [section_text(entry, name) for name in _SETTING]
+def _setting(entry: Entry) -> tuple[str, ...]:
+    return tuple(section_text(entry, name) for name in _SETTING)
 
 
 def tabulate_group(reader: Reader, group: VariantGroup) -> pd.DataFrame:
@@ -252,12 +248,12 @@ def _scores(reader: Reader, group: VariantGroup, epsilon: float) -> dict[str, di
     first = min((t for steps in tasks for t in steps if t > 0), default=0)
     return {
         one.label: {
-            "loss": final_losses(reader, one, "loss").by_seed,
-            "reachable_loss": final_losses(reader, one, "reachable_loss").by_seed,
-            "auc": mean_losses(reader, one, "loss").by_seed,
+            "loss": final_losses(reader, one, "loss"),
+            "reachable_loss": final_losses(reader, one, "reachable_loss"),
+            "auc": mean_losses(reader, one, "loss"),
             "coverage": coverages(reader, one, plane),
-            "control": scores_at(reader, one, first).by_seed if one.label in assessed else {},
-            "steps": steps_to(reader, one, "loss", epsilon, last_passage).by_seed,
+            "control": scores_at(reader, one, first) if one.label in assessed else {},
+            "steps": steps_to(reader, one, "loss", epsilon, last_passage),
         }
         for one in group.variants
     }
@@ -282,7 +278,7 @@ def _variant_row(
         "path": config.config["path"],
         "dt": config.config["env"]["dt"],
         "n": len(own["loss"]),
-        "n_diverged": sum(trial.status == "diverged" for trial in variant.finished),
+        "n_diverged": variant.n_diverged,
         "plan_us": _typical(reader, variant, "plan_us"),
         "learn_us": _typical(reader, variant, "learn_us"),
     }
@@ -402,4 +398,4 @@ def _free_run(found: Assessments, t: int, reached: int) -> dict[str, object]:
     """Return the mean error after t steps, and of how many trials it is not finite."""
     errors = found.values[:, found.t == t]
     finite = errors[np.isfinite(errors)]
-    return {"free_run": float(mean(finite)), "free_run_lost": max(0, reached - len(finite))}
+    return {"free_run": float(centre(finite)), "free_run_lost": max(0, reached - len(finite))}

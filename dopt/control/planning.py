@@ -56,42 +56,41 @@ Objective = Callable[[Array], Array]
 """Costs (N,) of input sequences (N, H, m); one that is not finite counts as the worst."""
 
 
-@dataclass(frozen=True)
-class CrossEntropy:
-    """A planner of input sequences with ‖u‖ ≤ ``gamma`` at every step.
+def cross_entropy(
+    objective: Objective,
+    start: Array,
+    rng: np.random.Generator,
+    *,
+    gamma: float,
+    samples: int,
+    iterations: int,
+    elites: int,
+) -> Array:
+    """Return the best sequence that was tried, (H, m); ``start`` (H, m) is the first.
 
-    Attributes
+    Every round tries the mean of the elites of the one before as it is, and the last mean is
+    tried as well. The first round is as wide as the ball of inputs, each component with
+    standard deviation γ/√m.
+
+    Parameters
     ----------
     gamma : float
         Bound γ of the norm of an input.
     samples, iterations, elites : int
         Sequences in a round, rounds, and sequences that the next round is sampled around.
     """
-
-    gamma: float
-    samples: int
-    iterations: int
-    elites: int
-
-    def plan(self, objective: Objective, start: Array, rng: np.random.Generator) -> Array:
-        """Return the best sequence that was tried, (H, m); ``start`` (H, m) is the first.
-
-        Every round tries the mean of the elites of the one before as it is, and the last mean is
-        tried as well. The first round is as wide as the ball of inputs, each component with
-        standard deviation γ/√m.
-        """
-        best, lowest = start, np.inf
-        mean, deviation = start, np.full(start.shape, self.gamma / np.sqrt(start.shape[1]))
-        for _ in range(self.iterations):
-            draws = rng.standard_normal((self.samples, *start.shape))
-            draws[0] = 0.0
-            U = within_ball(mean + deviation * draws, self.gamma)
-            J = _costs(objective, U)
-            elites = U[np.argsort(J, kind="stable")[: self.elites]]
-            if J.min() < lowest:
-                best, lowest = elites[0], J.min()
-            mean, deviation = elites.mean(axis=0), elites.std(axis=0)
-        return mean if _costs(objective, mean[None])[0] < lowest else best
+    best, lowest = start, np.inf
+    mean, deviation = start, np.full(start.shape, gamma / np.sqrt(start.shape[1]))
+    for _ in range(iterations):
+        draws = rng.standard_normal((samples, *start.shape))
+        draws[0] = 0.0
+        U = within_ball(mean + deviation * draws, gamma)
+        J = _costs(objective, U)
+        chosen = U[np.argsort(J, kind="stable")[:elites]]
+        if J.min() < lowest:
+            best, lowest = chosen[0], J.min()
+        mean, deviation = chosen.mean(axis=0), chosen.std(axis=0)
+    return mean if _costs(objective, mean[None])[0] < lowest else best
 
 
 def _costs(objective: Objective, inputs: Array) -> Array:
@@ -154,7 +153,7 @@ def run_episode(
         Draws of the planner.
     """
     goal = task.on(system)
-    planner = CrossEntropy(system.gamma, task.samples, task.iterations, task.elites)
+    sizes = {"samples": task.samples, "iterations": task.iterations, "elites": task.elites}
     plan = np.zeros((goal.lookahead, system.n_inputs))
     states = np.empty((goal.steps + 1, system.n_states))
     states[0] = goal.initial_state
@@ -163,7 +162,8 @@ def run_episode(
         if t % goal.hold == 0:
             if t:
                 plan = np.concatenate([plan[1:], np.zeros_like(plan[:1])])
-            plan = planner.plan(_objective(system, goal, forecast, states[t]), plan, rng)
+            ahead = _objective(system, goal, forecast, states[t])
+            plan = cross_entropy(ahead, plan, rng, gamma=system.gamma, **sizes)
         inputs[t] = plan[0]
         states[t + 1] = plant(states[t : t + 1], plan[None, :1])[0, 0] + noise[t]
     return _judged(system, goal, states, inputs)

@@ -12,24 +12,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from threading import TIMEOUT_MAX
 from types import FrameType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from dopt.arguments import finite, instance, measured, numbers, safe_input, seconds, whole, within
+from dopt.arguments import finite, instance, numbers, seconds, whole, within
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.refit import FitBeside, first_evidence, first_simulation
 from dopt.explorer.saving import Explored
-from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
+from dopt.explorer.state import PunctualPlanner, may_remember_plans
 from dopt.learning import Conditioning, GaussNewton, Learner, SimulationError
 from dopt.models import Model
 from dopt.policies import Policy
-from dopt.spec.config import LARGEST_HORIZON, completed
+from dopt.policies.base import ROUNDING
+from dopt.registry import section_of
+from dopt.spec.config import LARGEST_HORIZON, completed, difference
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
 from dopt.systems.plant import Plant
 from dopt.types import Array
 
@@ -189,7 +192,7 @@ class Explorer(Explored):
             model = {"name": "mlp", "depth": 1} if model is None else model
             if isinstance(plant, Plant):
                 plant = dataclasses.replace(plant, integrator="rk4")
-        system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
+        system = plant.system(steps) if isinstance(plant, Plant) else _declared(plant)
         spec = TrialSpec.of_system(
             *(system, policy),
             model=model or "mlp",
@@ -200,7 +203,7 @@ class Explorer(Explored):
         )
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, TIMEOUT_MAX)
-        self._fallback = safe_input(spec, fallback)
+        self._fallback = _safe_input(spec, fallback)
         about = _about(in_scaled_numbers(spec))
         self._journal = None if journal is None else Journal(journal, fsync, about)
         try:
@@ -486,10 +489,10 @@ class Explorer(Explored):
             return
         stored, given = completed(journal.events[0]["trial"]), completed(self.spec.to_mapping())
         if stored != given:
+            path, (then, now) = difference([stored, given])
             raise SpecificationError(
-                f"the journal {journal.path} belongs to another exploration "
-                f"({difference(stored, given)}): give the same arguments as then, or "
-                f"another file."
+                f"the journal {journal.path} belongs to another exploration ({path} was {then!r} "
+                f"and is {now!r}): give the same arguments as then, or another file."
             )
         for number, event in enumerate(journal.events[1:], start=2):
             if not self._state.may_replay(event):
@@ -522,3 +525,45 @@ class Explorer(Explored):
 def _about(spec: TrialSpec) -> Event:
     """Return the first line of a journal."""
     return {"format": FORMAT, "trial": spec.to_mapping()}
+
+
+def _declared(system: System) -> System:
+    """Return a system of which nothing but its declaration is used.
+
+    A black box, such as an environment of Gymnasium, is not started: its known part is compiled,
+    and its states are those that the explorer is told.
+
+    Raises
+    ------
+    SpecificationError
+        If its outputs mix states: those that begin an exploration would be unknown.
+    """
+    if system.output_matrix:
+        raise SpecificationError(
+            f"env.output_matrix is {list(system.output_matrix)}, but an explorer is told states, "
+            f"all of them or some: set env.measured_states, or take the outputs for states."
+        )
+    if not isinstance(system, BlackBox) or system.measured:
+        return system
+    kind, section = type(system), section_of(system)
+    declared: dict[str, Any] = {
+        "compiled": True,
+        "measured": True,
+        "to_section": lambda self: section,  # noqa: ARG005  # the system's own
+        "__module__": kind.__module__,
+    }
+    explored: type[System] = dataclasses.dataclass(frozen=True, kw_only=True)(
+        type(kind.__name__, (kind,), declared)
+    )
+    return explored(**{key.name: getattr(system, key.name) for key in dataclasses.fields(system)})
+
+
+def _safe_input(spec: TrialSpec, fallback: npt.ArrayLike | None) -> Array:
+    """Return the fallback, (m,), 0 unless it is given, or raise SpecificationError."""
+    m, gamma = spec.system.n_inputs, spec.system.gamma
+    u = np.zeros(m) if fallback is None else finite("fallback", fallback, m)
+    if np.linalg.norm(u) > gamma * (1 + ROUNDING):
+        raise SpecificationError(
+            f"fallback is {u.tolist()}, but its norm has to be at most {gamma:g}: lower it."
+        )
+    return u

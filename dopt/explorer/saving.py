@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from dopt.arguments import reals, whole
+from dopt.arguments import check_finite, reals, whole
 from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
@@ -108,17 +108,26 @@ def free_run_error(
     system = spec.system if system is None else system
     y, u = np.atleast_1d(reals("states", states)), np.atleast_1d(reals("inputs", inputs))
     steps = whole("steps", steps)
-    rows = _rows_of(system, y)
-    first = 0 if isinstance(rows, slice) else max(steps, 1)  # in which the filter settles
+    d, m, measured = system.n_states, system.n_inputs, list(system.measured_states)
+    filtered = y.ndim == 2 and y.shape[1] == len(measured) < d
+    rows = measured if filtered else slice(None)
+    first = max(steps, 1) if filtered else 0  # in which the filter settles
     n = (len(u) - first) // max(steps, 1)
-    _check_shapes(system, y, u, steps, n)
-    _check_finite(y, u)
+    width = len(measured) if filtered else d
+    if y.shape != (len(u) + 1, width) or u.shape != (len(u), m) or steps < 1 or n < 1:
+        raise SpecificationError(
+            f"a run with states of shape {y.shape} and inputs of shape {u.shape} was given for "
+            f"predictions of {steps} steps, but shapes (T + 1, {d}) and (T, {m}) with at least so "
+            f"many steps T, or of measured states alone twice as many, are expected: correct it."
+        )
+    check_finite("states", y)
+    check_finite("inputs", u)
     u = InFlight(system).acted(u)
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
     x = y
-    if not isinstance(rows, slice):
+    if filtered:
         found, learner = scaled(system), spec.learner
         learner = learner if isinstance(learner, JointKalman) else JointKalman()
         run = found.of_states(y, rows), found.of_inputs(u)
@@ -134,34 +143,6 @@ def free_run_error(
         )
     predicted = forecast_by(system, predict)(x[first:last:steps], cut)
     return relative_error(predicted[..., rows], ends, starts)
-
-
-def _rows_of(system: System, run: Array) -> slice | list[int]:
-    """Return the states that a run has: all of them, or those that are measured."""
-    given, measured = run.shape[-1] if run.ndim == 2 else 0, list(system.measured_states)
-    return measured if given == len(measured) < system.n_states else slice(None)
-
-
-def _check_shapes(system: System, run: Array, inputs: Array, steps: int, n: int) -> None:
-    d, m, measured = system.n_states, system.n_inputs, system.n_measured
-    fits = run.ndim == 2 and len(run) == len(inputs) + 1 and run.shape[1] in (d, measured or d)
-    if not fits or inputs.shape != (len(inputs), m) or steps < 1 or n < 1:
-        alone = f", or (T + 1, {measured}) and twice as many," if 0 < measured < d else ""
-        raise SpecificationError(
-            f"a run with states of shape {run.shape} and inputs of shape {inputs.shape} was given "
-            f"for predictions of {steps} steps, but shapes (T + 1, {d}) and (T, {m}) with at least "
-            f"so many steps T{alone} are expected: correct it."
-        )
-
-
-def _check_finite(run: Array, inputs: Array) -> None:
-    for what, rows in (("states", run), ("inputs", inputs)):
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        if len(bad):
-            raise SpecificationError(
-                f"a run was given in which the {what} of row {bad[0]} are {rows[bad[0]].tolist()}, "
-                f"but finite numbers are expected: give a part of the run without such rows."
-            )
 
 
 # States, inputs, errors and predictions of an exploration so far.

@@ -32,17 +32,19 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import logging
 import math
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dopt.errors import ExplorationError
+from dopt.evaluation import rates
 from dopt.explorer.journal import Event, is_event
 from dopt.explorer.refit import Found, Recording
 from dopt.explorer.signs import Signs
@@ -512,16 +514,11 @@ class ExplorerState:
         if self.spec.system.n_measured or (units == units[0]).all():
             return None
         x, following = self.steps.states[t : t + 2]
-        u, system, parameters = self.steps.inputs[t], self._scaled.system, self.steps.parameters
-
-        def rate(x: Array) -> Array:
-            known = system.known(tuple(x), tuple(u), system.parameters)
-            flow = np.array(known, dtype=float)
-            flow[self._rows] += self.spec.model.predict(system, parameters, x[None], u[None])[0]
-            return flow
-
+        u, system = self.steps.inputs[t], self._scaled.system
+        predict = functools.partial(self.spec.model.predict, system, self.steps.parameters)
+        rate = functools.partial(rates, system, predict, u[None])
         with np.errstate(all="ignore"):
-            missed = following - next_state(system.integrator, rate, x, dt)
+            missed = following - next_state(system.integrator, rate, x[None], dt)[0]
         return float(np.linalg.norm(units * missed[self._rows] / dt))
 
     def _watch_size(self, t: int, following: Array, u: Array, dt: float) -> None:
@@ -555,12 +552,3 @@ def _steps_of(spec: TrialSpec) -> Steps:
     from dopt.kernel.run import KernelSteps
 
     return KernelSteps(spec)
-
-
-def difference(stored: Any, given: Any, path: str = "") -> str:
-    """Return the first difference of two specifications, as text."""
-    if isinstance(stored, dict) and isinstance(given, dict):
-        for key in sorted({*stored, *given}, key=lambda key: (key != "name", key)):
-            if stored.get(key) != given.get(key):
-                return difference(stored.get(key), given.get(key), f"{path}.{key}".lstrip("."))
-    return f"{path} was {stored!r} and is {given!r}"

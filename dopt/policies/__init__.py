@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-from dopt.policies.base import InformationPolicy, Policy
-from dopt.policies.d_optimal import (
-    DOptimal,
-    GradientDOptimal,
-    GreedyLinear,
-    Oracle,
-    TraceLinearized,
-    Uniform,
-)
-from dopt.policies.held_candidates import Disagreement, GaussianProcessEntropy, SpaceFilling
-from dopt.policies.open_loop import (
-    PRBS,
-    Chirp,
-    Multisine,
-    Periodic,
-    PeriodicSquare,
-    RandomGaussian,
-    RandomHeld,
-    RandomSphere,
-)
-from dopt.policies.search import (
-    ICEM,
-    AOptimal,
-    EOptimal,
-    Episodic,
-    Exact,
-    Lookahead,
-    Search,
-    TaskOptimal,
-    Trace,
-)
+from dopt.policies.base import InformationPolicy as InformationPolicy
+from dopt.policies.base import Policy as Policy
+from dopt.policies.d_optimal import DOptimal as DOptimal
+from dopt.policies.d_optimal import GradientDOptimal as GradientDOptimal
+from dopt.policies.d_optimal import GreedyLinear as GreedyLinear
+from dopt.policies.d_optimal import Oracle as Oracle
+from dopt.policies.d_optimal import TraceLinearized as TraceLinearized
+from dopt.policies.d_optimal import Uniform as Uniform
+from dopt.policies.held_candidates import Disagreement as Disagreement
+from dopt.policies.held_candidates import GaussianProcessEntropy as GaussianProcessEntropy
+from dopt.policies.held_candidates import SpaceFilling as SpaceFilling
+from dopt.policies.open_loop import PRBS as PRBS
+from dopt.policies.open_loop import Chirp as Chirp
+from dopt.policies.open_loop import Multisine as Multisine
+from dopt.policies.open_loop import Periodic as Periodic
+from dopt.policies.open_loop import PeriodicSquare as PeriodicSquare
+from dopt.policies.open_loop import RandomGaussian as RandomGaussian
+from dopt.policies.open_loop import RandomHeld as RandomHeld
+from dopt.policies.open_loop import RandomSphere as RandomSphere
+from dopt.policies.search import ICEM as ICEM
+from dopt.policies.search import AOptimal as AOptimal
+from dopt.policies.search import EOptimal as EOptimal
+from dopt.policies.search import Episodic as Episodic
+from dopt.policies.search import Exact as Exact
+from dopt.policies.search import Lookahead as Lookahead
+from dopt.policies.search import Search as Search
+from dopt.policies.search import TaskOptimal as TaskOptimal
+from dopt.policies.search import Trace as Trace
 
 TITLES: dict[str, str] = {
     "d_optimal": "D-optimal",
@@ -99,35 +96,3 @@ POLICIES: dict[str, type[Policy]] = {
         SpaceFilling,
     )
 }
-
-__all__ = [
-    "ICEM",
-    "POLICIES",
-    "PRBS",
-    "AOptimal",
-    "Chirp",
-    "DOptimal",
-    "Disagreement",
-    "EOptimal",
-    "Episodic",
-    "Exact",
-    "GaussianProcessEntropy",
-    "GradientDOptimal",
-    "GreedyLinear",
-    "InformationPolicy",
-    "Lookahead",
-    "Multisine",
-    "Oracle",
-    "Periodic",
-    "PeriodicSquare",
-    "Policy",
-    "RandomGaussian",
-    "RandomHeld",
-    "RandomSphere",
-    "Search",
-    "SpaceFilling",
-    "TaskOptimal",
-    "Trace",
-    "TraceLinearized",
-    "Uniform",
-]

@@ -79,12 +79,7 @@ class OpenLoop(Policy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosedLoop(Policy):
-    """A policy that plans each input from the past and the current model."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class InformationPolicy(ClosedLoop):
+class InformationPolicy(Policy):
     """A closed-loop policy that plans with the information matrix M of the parameters.
 
     M₀ = λI. Accumulated information is M_{t+1} = M_t + JᵀJ with J at x_t and the parameters after
@@ -140,7 +135,7 @@ class Planner(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CustomPolicy(ClosedLoop):
+class CustomPolicy(Policy):
     """A closed-loop policy whose plan is written in numpy.
 
     In the kernel the interpreter calls it between compiled steps.
@@ -170,7 +165,7 @@ class TaskPolicy(CustomPolicy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompiledPolicy(ClosedLoop):
+class CompiledPolicy(Policy):
     """A closed-loop policy whose plan the kernel compiles.
 
     Derived from CustomPolicy as well, it runs on both paths. They agree where all that is random in

@@ -11,7 +11,7 @@ import numpy as np
 
 from dopt.errors import IncompatibleError
 from dopt.fields import parameter
-from dopt.policies.base import Array, ClosedLoop, CustomPolicy, InformationPolicy, Planner
+from dopt.policies.base import Array, CustomPolicy, InformationPolicy, Planner, Policy
 from dopt.policies.search import CandidatePolicy
 from dopt.sphere import sphere_maximizer
 from dopt.systems.base import System
@@ -295,17 +295,22 @@ class GreedyLinearPlan(Planner):
         B = system.featurize(view.input_matrix(view.states[0]).T).T
         solved = np.linalg.solve(self._gram, B)
         Q, v = B.T @ solved, -(solved.T @ center)
-        if not np.isfinite(v).all():
-            return np.full(system.n_inputs, np.nan)  # the model has overflowed
-        if len(v) == 1:
-            up = v[0] < 0.0 or (v[0] == 0.0 and view.tie[0] > 0.0)
-            return np.array([system.gamma if up else -system.gamma])
-        best: Array = sphere_maximizer(Q, v, system.gamma, view.tie)
-        return best
+        return best_on_sphere(Q, v, view.tie, system.gamma)
 
     def observe(self, view: TrialView) -> None:
         z = self._system.featurize(view.sampled[-1:])[0]
         self._gram += np.outer(z, z)
+
+
+def best_on_sphere(Q: Array, v: Array, tie: Array, gamma: float) -> Array:
+    """Return the maximiser of uᵀQu - 2vᵀu on ‖u‖ = γ, (m,); NaN where a model has overflowed."""
+    if not (np.isfinite(Q).all() and np.isfinite(v).all()):
+        return np.full_like(v, np.nan)
+    if len(v) == 1:
+        up = v[0] < 0.0 or (v[0] == 0.0 and tie[0] > 0.0)
+        return np.array([gamma if up else -gamma])
+    best: Array = sphere_maximizer(Q, v, gamma, tie)
+    return best
 
 
 def is_linear(system: System) -> bool:
@@ -326,7 +331,7 @@ def is_linear(system: System) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Uniform(ClosedLoop):
+class Uniform(Policy):
     """Maximise G(u) = Σ_{s≤t} ‖x(u) - x_s‖₂ on the sphere ‖u‖ = γ (section 3).
 
     The prediction x(u) = x_t + dt f_θ(x_t, u) is affine in u, so G is convex and its maximum over

@@ -19,7 +19,6 @@ from dopt.learning import Adam, AdamWindow
 from dopt.models import MLP
 from dopt.policies.base import (
     Array,
-    ClosedLoop,
     CustomPolicy,
     Planner,
     check_ensemble,
@@ -31,7 +30,7 @@ from dopt.trial_view import TrialView
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldCandidates(CandidatePolicy, ClosedLoop):
+class HeldCandidates(CandidatePolicy):
     """Predict where each of some inputs leads if it is held, and apply the best of them.
 
     Parameters
@@ -110,23 +109,24 @@ class Disagreement(HeldCandidates, CustomPolicy):
         self, system: System, model: MLP, learner: Adam, rng: np.random.Generator
     ) -> Planner:
         """Return the plan of a new trial whose networks learn as the trial's own."""
-        return DisagreementPlan(self, system, Networks(system, model, learner), rng)
+        return DisagreementPlan(self, system, model, learner, rng)
 
 
 class DisagreementPlan(Planner):
-    """The plan of one trial, with the networks beside the trial's own."""
+    """The plan of one trial, with K - 1 networks beside the trial's own, (K - 1, q)."""
 
     def __init__(
         self,
         policy: Disagreement,
         system: System,
-        networks: Networks,
+        model: MLP,
+        learner: Adam,
         rng: np.random.Generator,
     ) -> None:
-        self._system, self._networks = system, networks
+        self._system, self._model, self._learner = system, model, learner
         self._steps = policy.steps(system)
         self._inputs = policy.compared_inputs(system)
-        draw = functools.partial(networks.model.initial_parameters, system, rng)
+        draw = functools.partial(model.initial_parameters, system, rng)
         self._others = np.array([draw() for _ in range(policy.ensemble - 1)])
         self._moments, self._done = np.zeros((2, *self._others.shape)), 0
 
@@ -142,33 +142,24 @@ class DisagreementPlan(Planner):
         worth = np.zeros(len(states))
         for _ in range(self._steps):
             states = next_state(self._system.integrator, rate, states, self._system.dt)
-            worth += self._networks.predict(members, states).var(axis=0).sum(axis=1)
+            worth += self._predict(members, states).var(axis=0).sum(axis=1)
         return worth
 
     def _rate(self, members: Array, states: Array) -> Array:
         """Return dx/dt by the mean of the networks, (C, d), at a state for each candidate."""
         rate = self._system.known_flow(states, self._inputs)
-        rate[:, list(self._system.learned_rows)] += self._networks.predict(members, states).mean(
-            axis=0
-        )
+        rate[:, list(self._system.learned_rows)] += self._predict(members, states).mean(axis=0)
         return rate
 
     def observe(self, view: TrialView) -> None:
         """Train the other networks by the learning step of the trial's own."""
-        newest = slice(-self._networks.learner.window, None)
+        newest = slice(-self._learner.window, None)
         states, targets = view.sampled[newest], view.accelerations[newest]
-        gradient = self._networks.loss_gradient(self._others, states, targets)
+        gradient = self._loss_gradient(self._others, states, targets)
         self._done += 1
-        self._networks.adam_step(self._others, self._moments, gradient, self._done)
+        self._adam_step(self._others, self._moments, gradient, self._done)
 
-
-class Networks:
-    """Networks of one architecture that learn together; parameters are (K, q)."""
-
-    def __init__(self, system: System, model: MLP, learner: Adam) -> None:
-        self._system, self.model, self.learner = system, model, learner
-
-    def predict(self, parameters: Array, states: Array) -> Array:
+    def _predict(self, parameters: Array, states: Array) -> Array:
         """Return the accelerations of each network, (K, N, r), at states (N, d)."""
         return self._values(parameters, states)[-1]
 
@@ -184,7 +175,7 @@ class Networks:
 
     def _layers(self, parameters: Array) -> list[tuple[Array, Array]]:
         """Return views of the weights, (K, outputs, inputs), and biases of each layer."""
-        sizes, first, layers = self.model.layer_sizes(self._system), 0, []
+        sizes, first, layers = self._model.layer_sizes(self._system), 0, []
         for n_in, n_out in itertools.pairwise(sizes):
             middle, last = first + n_in * n_out, first + (n_in + 1) * n_out
             W = parameters[:, first:middle].reshape(len(parameters), n_out, n_in)
@@ -192,7 +183,7 @@ class Networks:
             first = last
         return layers
 
-    def loss_gradient(self, parameters: Array, states: Array, targets: Array) -> Array:
+    def _loss_gradient(self, parameters: Array, states: Array, targets: Array) -> Array:
         """Return the gradient of mean_n ‖a_θ(x_n) - y_n‖² by each θ, (K, q)."""
         values, layers = self._values(parameters, states), self._layers(parameters)
         delta = 2.0 / len(states) * (values[-1] - targets)
@@ -204,9 +195,9 @@ class Networks:
             delta = (delta @ layers[i][0]) * (1.0 - below**2)
         return np.concatenate(parts, axis=1)
 
-    def adam_step(self, parameters: Array, moments: Array, gradient: Array, step: int) -> None:
+    def _adam_step(self, parameters: Array, moments: Array, gradient: Array, step: int) -> None:
         """Take Adam's step of a number, from 1, in place; moments are (2, K, q)."""
-        rule, (first, second) = self.learner, moments
+        rule, (first, second) = self._learner, moments
         first += (1.0 - rule.beta_1) * (gradient - first)
         second += (1.0 - rule.beta_2) * (gradient**2 - second)
         deviation = np.sqrt(second / (1.0 - rule.beta_2**step)) + rule.epsilon

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.algorithm import Score
-from dopt.errors import IncompatibleError, SpecificationError
+from dopt.errors import IncompatibleError
 from dopt.fields import parameter
 from dopt.policies.base import Array, InformationPolicy, Policy, check_length, on_sphere
 from dopt.systems.base import System
@@ -43,17 +43,7 @@ def sphere_directions(n_inputs: int, count: int) -> Array:
         m.
     count : int
         C, odd or even. One input has two directions, whatever the count.
-
-    Raises
-    ------
-    SpecificationError
-        If either number is below 1.
     """
-    if n_inputs < 1 or count < 1:
-        raise SpecificationError(
-            f"{count} directions of {n_inputs} inputs are asked for, but at least 1 direction of "
-            f"at least 1 input is expected: give two whole numbers above 0."
-        )
     if n_inputs == 1:
         return np.array([[1.0], [-1.0]])
     if n_inputs == 2:

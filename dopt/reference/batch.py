@@ -17,7 +17,7 @@ from torch import Tensor
 from dopt.control.task import Feedback
 from dopt.custom_planner import custom_planner, custom_updater
 from dopt.errors import SpecificationError
-from dopt.evaluation import evaluation_set
+from dopt.evaluation import evaluation_set, rates
 from dopt.learning import Adam
 from dopt.learning.base import CustomLearner, check_update
 from dopt.policies import DOptimal, InformationPolicy, Uniform
@@ -524,19 +524,13 @@ class ReferenceSteps:
 
     def reached(self, t: int, inputs: Array, seconds: Array) -> Array:
         """Return the state, (d,), predicted from x_t after inputs (n, m) held for times (n,)."""
-        x: Array = self.states[t]
-        integrator = self._spec.system.integrator
+        x, system = self.states[t : t + 1], self._spec.system
+        predict = functools.partial(self._spec.model.predict, system, self.parameters)
         for u, dt in zip(inputs, seconds, strict=True):
-            x = next_state(integrator, functools.partial(self._rate, u), x, float(dt))
-        return x
-
-    def _rate(self, u: Array, x: Array) -> Array:
-        """Return dx/dt of the model, (d,)."""
-        system, model = self._spec.system, self._spec.model
-        rate = np.array(system.known(tuple(x), tuple(u), system.parameters), dtype=float)
-        learned = model.predict(system, self.parameters, x[None], u[None])[0]
-        rate[list(system.learned_rows)] += learned
-        return rate
+            rate = functools.partial(rates, system, predict, u[None])
+            x = next_state(system.integrator, rate, x, float(dt))
+        found: Array = x[0]
+        return found
 
     def note_asked(self, u: Array) -> None:
         """Limits, which count rates from this input, are not enforced here."""

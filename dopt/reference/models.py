@@ -24,7 +24,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -35,8 +35,8 @@ from torch.nn.utils import parameters_to_vector
 from dopt.algorithm import TIE_MARGIN
 from dopt.errors import SpecificationError
 from dopt.models import MLP, Linear, Model
+from dopt.policies.d_optimal import best_on_sphere
 from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
-from dopt.sphere import sphere_maximizer
 from dopt.systems.base import System, feature_values, next_state
 from dopt.systems.properties import STEP
 from dopt.types import Array, Scalar
@@ -65,39 +65,18 @@ def features(system: System, x: Tensor) -> Tensor:
     return torch.stack(values, dim=-1)
 
 
-class Layer(NamedTuple):
-    """Linear layers of n trials."""
-
-    weights: Tensor  # (n, inputs, outputs)
-    biases: Tensor  # (n, 1, outputs)
-
-    def __call__(self, h: Tensor) -> Tensor:
-        """Return the outputs, (n, N, ·), at inputs (n, N, ·)."""
-        return torch.baddbmm(self.biases, h, self.weights)
-
-
-def layers(theta: Tensor, shapes: Sequence[tuple[int, int]]) -> list[Layer]:
-    """Cut parameters, (n, q), into layers of the shapes (inputs, outputs).
-
-    Each layer has its matrix, outputs by inputs, and then its biases.
-    """
-    parts = iter(theta.split([n for n_in, n_out in shapes for n in (n_in * n_out, n_out)], dim=1))
-    return [
-        Layer(next(parts).unflatten(1, (n_out, n_in)).mT, next(parts).unsqueeze(1))
-        for n_in, n_out in shapes
-    ]
-
-
 def mlp_function(system: System, model: MLP) -> BatchModel:
-    """Return layers with tanh between them."""
+    """Return layers with tanh between them; each has its matrix, outputs by inputs, and biases."""
     shapes = list(zip(model.layer_inputs(system), model.layer_sizes(system)[1:], strict=True))
+    sizes = [n for n_in, n_out in shapes for n in (n_in * n_out, n_out)]
 
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        *hidden, output = layers(theta, shapes)
+        parts = iter(theta.split(sizes, dim=1))
         h = features(system, x).expand(len(theta), -1, -1)
-        for layer in hidden:
-            h = layer(h).tanh()
-        return output(h)
+        for layer, (n_in, n_out) in enumerate(shapes):
+            W, b = next(parts).unflatten(1, (n_out, n_in)).mT, next(parts).unsqueeze(1)
+            h = torch.baddbmm(b, h.tanh() if layer else h, W)
+        return h
 
     return accelerations
 
@@ -535,13 +514,6 @@ def cholesky_factor(matrix: Tensor) -> Tensor:
     return torch.where((failed > 0)[:, None, None], torch.nan, factor)
 
 
-class QuadraticProblem(NamedTuple):
-    """Equation 7 for a batch of n trials: maximise uᵀQu - 2vᵀu on the sphere."""
-
-    Q: Tensor  # (n, m, m)
-    v: Tensor  # (n, m)
-
-
 def predicted_states(system: System, model: BatchModel, theta: Tensor, x: Tensor) -> Tensor:
     """Return x̄ of every trial, (n, d), for parameters (n, q) and states (n, d)."""
     zero = torch.zeros(len(x), system.n_inputs, dtype=x.dtype, device=x.device)
@@ -567,10 +539,14 @@ def planning_columns(
     return torch.cat([g.view(n, m, -1)[:, :1], DB.view(n, m, -1)], dim=1)
 
 
+QuadraticProblem = tuple[Tensor, Tensor]
+"""Q, (n, m, m), and v, (n, m), of equation 7: maximise uᵀQu - 2vᵀu on the sphere."""
+
+
 def quadratic_problem(columns: Tensor, information: BatchInformation) -> QuadraticProblem:
     """Return Q and v from the :func:`planning_columns`, (n, 1 + m, s)."""
     forms = columns @ information.solve(columns.mT)
-    return QuadraticProblem(forms[:, 1:, 1:], -forms[:, 1:, 0])
+    return forms[:, 1:, 1:], -forms[:, 1:, 0]
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
@@ -581,7 +557,7 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     Q, v = problem
     if len(v) == 1:
         Q_0, v_0, tie = (one[0].numpy(force=True) for one in (Q, v, ties))
-        return v.new_tensor(_input_of_one(Q_0, v_0, tie, gamma))[None]
+        return v.new_tensor(best_on_sphere(Q_0, v_0, tie, gamma))[None]
     finite = torch.cat([Q, v.unsqueeze(-1)], dim=-1).isfinite().all(-1).all(-1, keepdim=True)
     if v.shape[1] == 1:
         up = (v < 0) | ((v == 0) & (ties > 0))
@@ -590,16 +566,6 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
         Q, v = torch.where(finite.unsqueeze(-1), Q, 0.0), torch.where(finite, v, 0.0)
         chosen = maximize_on_spheres(Q, v, gamma, ties)
     return torch.where(finite, chosen, torch.nan)
-
-
-def _input_of_one(Q: Array, v: Array, tie: Array, gamma: float) -> Array:
-    """Return the maximiser, (m,), of one trial, in numpy."""
-    if not (np.isfinite(Q).all() and np.isfinite(v).all()):
-        return np.full_like(v, np.nan)
-    if len(v) == 1:
-        up = v[0] < 0 or (v[0] == 0 and tie[0] > 0)
-        return np.array([gamma if up else -gamma])
-    return sphere_maximizer(Q, v, gamma, tie)
 
 
 def uniform_inputs(

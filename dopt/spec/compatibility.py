@@ -166,17 +166,13 @@ REFERENCE_POLICIES = (DOptimal, Oracle, Uniform)
 
 def _kernel_alone(what: str, parts: tuple[System, Policy, Model, Learner]) -> str:
     """Return the sentence for what runs in the compiled kernel alone."""
-    in_torch = [f"{one.section} '{one.name}'" for one in parts if not one.compiled]
-    if not in_torch:
-        return (
-            f"{what} runs in the compiled kernel alone, but path is 'reference', as with "
-            f"executor=lockstep: leave path out, or set executor=local."
-        )
+    in_torch = [f"{one.section} '{one.name}' runs in torch" for one in parts if not one.compiled]
+    why = in_torch[0] if in_torch else "path is 'reference', as with executor=lockstep"
     return (
-        f"{what} runs in the compiled kernel alone, but {in_torch[0]} runs in torch, which has the "
-        f"policies {', '.join(one.name for one in REFERENCE_POLICIES)}, open-loop ones and plans "
-        f"in numpy, with learner 'adam' or 'adam_window': choose among these, or a compiled "
-        f"{in_torch[0].partition(' ')[0]}."
+        f"{what} runs in the compiled kernel alone, but {why}: choose compiled parts alone and "
+        f"leave path out, with executor=local, or what runs in torch: the policies "
+        f"{', '.join(one.name for one in REFERENCE_POLICIES)}, open-loop ones and plans in numpy, "
+        f"with learner 'adam' or 'adam_window'."
     )
 
 

@@ -374,8 +374,13 @@ def config_label(config: Mapping[str, object]) -> str:
 
     Settings of a user's class are compared where that class is loaded, and left out elsewhere.
     """
+    return _label(flatten(config), unusual(config), titled=True)
+
+
+def unusual(config: Mapping[str, object]) -> set[str]:
+    """Return the dotted paths of settings that have another value than the default."""
     flat = flatten(config)
-    return _label(flat, _named(flat, usual_values(config), set(flat)), titled=True)
+    return _named(flat, usual_values(config), set(flat))
 
 
 def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
@@ -425,8 +430,7 @@ def _label(flat: Flat, paths: Collection[str], titled: bool, digits: int = 6) ->
 
 def limits_label(config: Mapping[str, object]) -> str:
     """Return the words for limits, such as ``limits, y=[-2, 2]``; empty without any."""
-    flat = flatten(config)
-    named = _named(flat, usual_values(config), set(flat))
+    flat, named = flatten(config), unusual(config)
     paths = [path for path in _paths([flat]) if path in named and path.startswith("limits.")]
     return ", ".join(_words(flat, paths))
 
@@ -475,6 +479,20 @@ def flatten(config: Mapping[str, object], prefix: str = "") -> dict[str, object]
         path = f"{prefix}{key}"
         flat.update(flatten(value, f"{path}.") if isinstance(value, Mapping) else {path: value})
     return flat
+
+
+def difference(configs: Sequence[Mapping[str, object]]) -> tuple[str, list[object]]:
+    """Return the first dotted path in which configurations differ, and its values.
+
+    One that all of them have goes before one that some lack.
+    """
+    flat = [flatten(config) for config in configs]
+    known = set().union(*flat)
+    paths = [path for path in known if any(one.get(path) != flat[0].get(path) for one in flat)]
+    if not paths:
+        return "config_key", [None for _ in configs]
+    path = min(paths, key=lambda one: (not all(one in entry for entry in flat), one))
+    return path, [entry.get(path) for entry in flat]
 
 
 def _defaults(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:

@@ -12,8 +12,9 @@ import numpy as np
 from dopt.errors import ScaleWarning, SpecificationError, suggestion
 from dopt.learning import Learner
 from dopt.models import MLP, Model
+from dopt.models.linear import linear_terms
 from dopt.policies import Policy
-from dopt.systems.base import KINDS, Array, Feature, System
+from dopt.systems.base import KINDS, Array, System
 from dopt.systems.black_box import BlackBox
 from dopt.systems.properties import input_effect
 
@@ -125,7 +126,7 @@ def check_names(system: System) -> None:
 
 
 def check_linear(system: System, points: Array) -> None:
-    """Refuse parameters in which the accelerations are not affine, at points, (d, n).
+    """Refuse parameters in which the accelerations are not affine, at points, (n, d).
 
     The oracle takes them as offset + Psi theta (:attr:`System.linear_form`).
 
@@ -137,8 +138,11 @@ def check_linear(system: System, points: Array) -> None:
     names = system.linear_parameters
     if not names:
         return
-    with np.errstate(all="ignore"):
-        affine = all(_is_affine(system, points, factor) for factor in FACTORS)
+    try:
+        with np.errstate(all="ignore"):
+            affine = all(_is_affine(system, points, factor) for factor in FACTORS)
+    except ArithmeticError:
+        affine = False
     if not affine:
         raise SpecificationError(
             f"linear_parameters of env '{system.name}' are {', '.join(names)}, but its "
@@ -149,25 +153,15 @@ def check_linear(system: System, points: Array) -> None:
 
 def _is_affine(system: System, points: Array, factor: float) -> bool:
     """Return whether the linear form gives the accelerations at a multiple of the parameters."""
-    names = system.linear_parameters
     values = dict(zip(system.physical, system.parameters, strict=True))
-    theta = factor * np.array([values[name] or 1.0 for name in names])
-    offset, *ones = (_at(system, points, parameters) for parameters in system.linear_form)
-    terms = np.array([offset, *(theta[:, None, None] * (np.array(ones) - offset))])
-    moved = values | dict(zip(names, theta.tolist(), strict=True))
-    found = _at(system, points, tuple(moved[name] for name in system.physical))
-    apart = np.abs(found - terms.sum(axis=0)).max()
-    return bool(apart <= AFFINE * (1.0 + np.abs(terms).max()))
-
-
-def _at(system: System, points: Array, parameters: tuple[float, ...]) -> Array:
-    """Return the accelerations, (r, n); NaN where they cannot be computed."""
-    shape = (system.n_learned, points.shape[1])
-    try:
-        values = system.accelerations(tuple(points), parameters)
-        return np.array([np.broadcast_to(value, shape[1:]) for value in values], dtype=float)
-    except ArithmeticError:
-        return np.full(shape, np.nan)
+    theta = factor * np.array([values[name] or 1.0 for name in system.linear_parameters])
+    values |= zip(system.linear_parameters, theta.tolist(), strict=True)
+    offset, psi = linear_terms(system, points)
+    rows = system.accelerations(tuple(points.T), tuple(values.values()))
+    found = np.stack(np.broadcast_arrays(*rows, points[:, 0])[:-1], axis=-1)
+    apart = np.abs(found - offset - psi @ theta).max()
+    largest = max(np.abs(offset).max(), np.abs(psi * theta).max())
+    return bool(apart <= AFFINE * (1.0 + largest))
 
 
 def check_finite(system: System) -> None:
@@ -178,43 +172,29 @@ def check_finite(system: System) -> None:
     SpecificationError
         If an acceleration is not at one of these states, or the known part at the first one.
     """
-    start, rest = np.array([system.initial_state]), np.zeros(system.n_inputs)
+    start, grid = np.array([system.initial_state]), system.grid()
     with np.errstate(all="ignore"):
-        flow = system.known(tuple(start[0]), tuple(rest), system.parameters)
-        first, grid = system.learned(start), system.learned(system.grid())
-    learned = [system.state_labels[row] for row in system.learned_rows]
-    _refuse(system, "known", np.array([flow], float), start, system.state_labels, INITIAL)
-    _refuse(system, "accelerations", first, start, learned, INITIAL)
-    _refuse(system, "accelerations", grid, system.grid(), learned, GRID)
+        flow = system.known_flow(start, np.zeros((1, system.n_inputs)))
+        first, rest = system.learned(start), system.learned(grid)
+    learned = tuple(system.state_labels[row] for row in system.learned_rows)
+    for what, values, labels, states in (
+        ("known", flow, system.state_labels, start),
+        ("accelerations", first, learned, start),
+        ("accelerations", rest, learned, grid),
+    ):
+        place, field = INITIAL if states is start else GRID
+        for i, k in np.argwhere(~np.isfinite(values))[:1]:
+            named = zip(system.state_labels, states[i], strict=True)
+            raise SpecificationError(
+                f"{what}() of env '{system.name}' gives {values[i, k]} for the derivative of "
+                f"{labels[k]} at {place}, {', '.join(f'{one} = {x:.4g}' for one, x in named)}, but "
+                f"a finite number is expected: correct the equation, or {field}."
+            )
 
 
 INITIAL = "the initial state", "env.initial_state"
 GRID = "a state of the evaluation grid", "env.grid_half_widths"
 """State at which an equation has to be finite, and the field that moves it."""
-
-
-def _refuse(
-    system: System,
-    what: str,
-    values: Array,
-    states: Array,
-    labels: tuple[str, ...] | list[str],
-    where: tuple[str, str],
-) -> None:
-    """Refuse values, (N, k), of an equation at states, (N, d), that are not finite."""
-    wrong = np.argwhere(~np.isfinite(values))
-    if not len(wrong):
-        return
-    i, k = wrong[0]
-    state = ", ".join(
-        f"{label} = {x:.4g}" for label, x in zip(system.state_labels, states[i], strict=True)
-    )
-    place, field = where
-    raise SpecificationError(
-        f"{what}() of env '{system.name}' gives {values[i, k]} for the derivative of {labels[k]} "
-        f"at {place}, {state}, but a finite number is expected: correct the equation, or {field}."
-    )
-
 
 STATES = 5
 """States at once at which the equations are tried."""
@@ -257,7 +237,7 @@ def check_system(system: System) -> None:
     _try(system, "accelerations", system.n_learned, tuple(points))
     _try(system, "known", system.n_states, tuple(states), tuple(inputs))
     check_finite(system)
-    check_linear(system, points)
+    check_linear(system, points.T)
     if not input_effect(system).is_affine:
         raise SpecificationError(
             f"known() of env '{system.name}' is not affine in the inputs, but a derivative of the "
@@ -307,15 +287,10 @@ def _moved(system: System, point: Any, step: complex) -> Any:
 def _check_indices(system: System) -> None:
     d, name = system.n_states, system.name
     for feature in system.features:
-        if not isinstance(feature, Feature):
+        if getattr(feature, "kind", None) not in KINDS:
             raise SpecificationError(
-                f"features of env '{name}' hold {feature!r}, but entries like "
-                f"Feature('cos', 0) are expected: make it a dopt.systems.Feature."
-            )
-        if feature.kind not in KINDS:
-            raise SpecificationError(
-                f"features of env '{name}' hold one of kind '{feature.kind}', but the kinds are "
-                f"{', '.join(KINDS)}: take one of them."
+                f"features of env '{name}' hold {feature!r}, but entries like Feature('cos', 0) of "
+                f"the kinds {', '.join(KINDS)} are expected: make it one of these."
             )
     declared = {
         "learned_rows": system.learned_rows,
@@ -355,16 +330,11 @@ def _try(system: System, what: str, size: int, *arguments: Sequence[Any]) -> Non
             f"dopt.systems.elementary are expected in it, which serve numbers, arrays and tensors "
             f"alike: write it with these."
         ) from error
-    if single:
+    if single or len(found) != size:
+        returned = "one number" if single else f"{len(found)} numbers"
         raise SpecificationError(
-            f"{what}() of env '{system.name}' returns one number, but a tuple of {size} is "
-            f"expected, one for each {entry}: return {'a,' if size == 1 else 'a, b, ...'} "
-            f"with its comma{'' if size == 1 else 's'}."
-        )
-    if len(found) != size:
-        raise SpecificationError(
-            f"{what}() of env '{system.name}' returns {len(found)} numbers, but {size} are "
-            f"expected, one for each {entry}: correct it."
+            f"{what}() of env '{system.name}' returns {returned}, but a tuple of {size} is "
+            f"expected, one for each {entry}: correct it; a tuple of one is written with its comma."
         )
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dopt.arguments import reals
+from dopt.arguments import rows_of
 from dopt.control.planning import Accelerations
 from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS, GaussNewton
@@ -154,10 +154,10 @@ def learned_accelerations(
         If states or inputs are no numbers, or not of these shapes.
     """
     found, system = scaled(spec.system), spec.system
-    x = _rows("states", states, system.n_states)
+    x = rows_of("states", states, system.n_states)
     u: Array | None = None
     if inputs is not None:
-        u = _rows("inputs", inputs, system.n_inputs)
+        u = rows_of("inputs", inputs, system.n_inputs)
         if len(u) not in (1, len(x)):
             raise SpecificationError(
                 f"{len(x)} states and {len(u)} inputs were given, but as many of both are "
@@ -166,13 +166,3 @@ def learned_accelerations(
         u = found.of_inputs(np.broadcast_to(u, (len(x), system.n_inputs)))
     values = spec.model.predict(found.system, parameters, found.of_states(x), u)
     return values * found.accelerations
-
-
-def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
-    rows = np.atleast_2d(reals(what, given))
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise SpecificationError(
-            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
-            f"them."
-        )
-    return rows

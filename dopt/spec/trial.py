@@ -14,17 +14,16 @@ import json
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
-
-from dopt.control import Control, task_from
+from dopt.arguments import instance, whole
+from dopt.control import TASKS, Control
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Validated, default_path, parameter
 from dopt.learning import LEARNERS, Learner
-from dopt.limits import Limits, limits_from
+from dopt.limits import LIMITS, Limits
 from dopt.models import MODELS, Model
 from dopt.models.base import MLP
 from dopt.policies import POLICIES, Policy
-from dopt.registry import TARGET, Part, build, check_stored
+from dopt.registry import TARGET, Part, build, build_optional, check_stored
 from dopt.spec.config import SECTIONS, TrialConfig, config_label, without_versions
 from dopt.systems import System, system_from_mapping
 
@@ -48,16 +47,7 @@ class TrialSpec(Validated):
     seed: int = parameter(0, bound="nonnegative")
 
     def __post_init__(self) -> None:
-        given: object = self.seed
-        if isinstance(given, np.integer):
-            object.__setattr__(self, "seed", int(given))
-        whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
-        if not whole or not 0 <= self.seed <= LARGEST_SEED:
-            shown = "null" if given is None else repr(self.seed)
-            raise SpecificationError(
-                f"seed is {shown}, but a whole number of 0 or above and below 2^63 is "
-                f"expected: set seed to a whole number in this range."
-            )
+        object.__setattr__(self, "seed", whole("seed", self.seed, 0, LARGEST_SEED))
 
     @classmethod
     def from_mapping(cls, given: Mapping[str, object]) -> TrialSpec:
@@ -103,9 +93,10 @@ class TrialSpec(Validated):
         learner = build("learner", LEARNERS, sections["learner"])
         path = given.get("path")
         path = default_path((system, policy, model, learner)) if path is None else str(path)
-        optional = task_from(given.get("task")), limits_from(given.get("limits"))
+        task = build_optional("task", TASKS, given.get("task"))
+        limits = build_optional("limits", LIMITS, given.get("limits"))
         sampled = _assesses_samples(given.get("assess"))
-        config = TrialConfig(system, policy, model, learner, path, *optional, sampled)
+        config = TrialConfig(system, policy, model, learner, path, task, limits, sampled)
         return cls(config, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 
     @classmethod
@@ -127,7 +118,7 @@ class TrialSpec(Validated):
             Name of a registered class, with the defaults of its fields; or a section with the
             ``name`` and the fields that differ: ``env={"name": "pendulum", "gamma": 3.0}``.
         limits : mapping, optional
-            Bounds and rates (:meth:`dopt.limits.Limits.from_section`), such as
+            Bounds and rates (:class:`dopt.limits.Limits`), such as
             ``{"bounds": {"y": [-2, 2]}}``.
         seed : int
             Seed of the noise, the initial parameters and the policy's own draws.
@@ -172,7 +163,8 @@ class TrialSpec(Validated):
         }
         rest: dict[str, object] = {"seed": seed, "limits": limits}
         rest |= {"path": path} if path else {}
-        _check_system(system)
+        expected = "an object such as SYSTEMS['pendulum'](), and for a name TrialSpec.from_names,"
+        instance("the system of TrialSpec.of_system", system, System, expected)
         return cls._of_parts(system, parts, rest)
 
     def with_seed(self, seed: int) -> TrialSpec:
@@ -270,20 +262,6 @@ def _assesses_samples(section: object) -> bool:
     raise SpecificationError(
         f"configuration key 'assess' is {section!r}, but a section with sample_loss, true or "
         f"false, is expected: write for instance assess.sample_loss=true."
-    )
-
-
-def _check_system(system: object) -> None:
-    """Refuse what is no system, such as a class of systems or a name."""
-    if isinstance(system, System):
-        return
-    if isinstance(system, type) and issubclass(system, System):
-        given, remedy = f"the class {system.__name__}", f"give an object of it, {system.__name__}()"
-    else:
-        given, remedy = repr(system), "use TrialSpec.from_names for a name or a section"
-    raise SpecificationError(
-        f"the system of TrialSpec.of_system is {given}, but an object of a class derived from "
-        f"dopt.systems.System is expected: {remedy}."
     )
 
 

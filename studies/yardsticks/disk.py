@@ -10,12 +10,13 @@ import numpy as np
 import pandas as pd
 
 from analysis.data.matching import Filter
-from analysis.data.samples import learned_model, violation_shares
+from analysis.data.samples import learned_model
 from analysis.data.selection import Entry, policy_rank
 from analysis.style import within
 from analysis.tables.rendering import TextTable
 from dopt.assessment import model_forecast
 from dopt.control.planning import forecast_by_equations
+from dopt.limits import VIOLATIONS
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System, UnbalancedDisk
 from dopt.types import Array
@@ -87,6 +88,19 @@ def _place(entry: Entry) -> tuple[object, ...]:
 
 def _words(entry: Entry) -> str:
     return f"of the disk {LIMITS[_enforced(entry)]} with the policy '{_policy(entry)}'"
+
+
+def violation_shares(reader: Reader, entry: Entry) -> dict[int, float]:
+    """Return the share of steps after which a bound is exceeded, by the seed of a finished trial.
+
+    Steps before a trial diverged count. Trials without limits have none.
+    """
+    found = reader.assessments(entry.config.config_key, VIOLATIONS)
+    values = found.values / np.maximum(found.t, 1)
+    counted = dict(zip(found.seeds.tolist(), values, strict=True))
+    rows = {one.seed: counted[one.seed] for one in entry.finished if one.seed in counted}
+    finite = {seed: row[np.isfinite(row)] for seed, row in rows.items()}
+    return {seed: float(row.sum()) for seed, row in finite.items() if len(row)}
 
 
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:

@@ -14,9 +14,12 @@ from analysis.data.selection import Entry, policy_rank
 from analysis.stats.scores import last_passage
 from analysis.style import steps_text, within
 from analysis.tables.rendering import TextTable
-from dopt.assessment import loss_by_parameter_error
+from dopt.assessment import true_parameters
+from dopt.errors import SpecificationError
+from dopt.evaluation import evaluation_set
+from dopt.models.linear import linear_terms
 from dopt.spec.trial import system_of
-from dopt.systems import CoupledPendulums
+from dopt.systems import CoupledPendulums, System
 from orchestrate.store import ConfigRow, Reader
 from studies.yardsticks.common import (
     FLEX_LONGEST,
@@ -36,6 +39,9 @@ NAME = "flex_table3"
 
 ERROR = 1e-2
 """Euclidean norm of the error of the frictions [1/s] that is to be reached."""
+
+TOLERANCE = 1e-9
+"""Relative difference of two mean squares of regressors that counts as rounding."""
 
 _SEED = 20_230_426
 
@@ -68,6 +74,33 @@ def _place(entry: Entry) -> tuple[object, ...]:
 
 def _words(entry: Entry) -> str:
     return f"with {_size(entry)} pendulums and the policy '{entry.config.policy}'"
+
+
+def loss_by_parameter_error(system: System) -> float:
+    """Return c such that the loss of the linear model is c ‖θ - θ*‖₂ for every θ.
+
+    The squared loss is (θ - θ*)ᵀ G (θ - θ*), with G the mean of ΨᵀΨ over the evaluation grid. It is
+    a multiple of the squared parameter error if G = c² I.
+
+    Raises
+    ------
+    SpecificationError
+        If G is no multiple of the identity matrix, or the system changes with time.
+    """
+    q, points = len(true_parameters(system)), evaluation_set(system)
+    at = system.points(points.states, points.inputs)[: points.n_grid]
+    _, regressors = linear_terms(system, at)
+    G = np.einsum("nri,nrj->ij", regressors, regressors) / len(at)
+    square = float(G[0, 0])
+    if len(system.history) > 1 or not np.allclose(
+        G, square * np.eye(q), rtol=0.0, atol=TOLERANCE * abs(square)
+    ):
+        raise SpecificationError(
+            f"the loss of env '{system.name}' weighs its parameters differently, but a parameter "
+            f"error follows from a loss that weighs all alike: run the trials again with "
+            f"dopt.run and compare their parameters."
+        )
+    return float(np.sqrt(square))
 
 
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:

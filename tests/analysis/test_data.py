@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import analysis
-from analysis.data.matching import AnalysisError, Filter, defaults, nearness, newest
+from analysis.data.matching import AnalysisError, Filter, nearness, newest
 from analysis.data.samples import learned_model, simulated_trial
 from analysis.data.selection import is_possible, select
 from analysis.figures.phase_portraits import measure_portraits, measure_spectra, tabulate_portraits
@@ -22,6 +22,7 @@ from analysis.tables.comparisons import compare_policies
 from analysis.tables.rendering import TABLES
 from dopt.errors import SpecificationError
 from dopt.run import run_trial
+from dopt.spec.config import usual_values
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Curves, NoDatabaseError, Reader
 from orchestrate.store.schema import STEP_VALUES
@@ -130,11 +131,11 @@ def test_a_model_of_no_trial_or_of_wrong_states_is_a_sentence(results: analysis.
 @pytest.mark.parametrize(
     ("request_", "sentence"),
     [
-        ({"where": "model.width=16"}, r"^where is 'model.width=16', .*where=\{'model.width': 16\}"),
-        ({"where": ["model.width=16"]}, r"^where is \['model.width=16'\], .*'model.width': 16\}"),
+        ({"where": "model.width=16"}, r"^where is 'model.width=16', .*where=\{'model.width': 32\}"),
+        ({"where": ["model.width=16"]}, r"^where is \['model.width=16'\], .*'model.width': 32\}"),
         ({"where": {3: 4}}, r"^where is \{3: 4\}, but a mapping of dotted paths"),
         ({"where": {"model.width": np.int64(5)}}, r"model.width=\S+ fits no stored"),
-        ({"env": 3}, r"^env is 3, but a name or a list of names is expected: write .*\]\.$"),
+        ({"env": 3}, r"^env is 3, but a name or a list of names is expected: write .*\.$"),
         ({"policy": ["random", None]}, r"^policy is \['random', None\], but a name"),
         ({"env": ["pendulum", "motr"]}, r"no trial of environment 'motr', choose one of cartpole"),
         ({"policy": "greedy"}, r"no trial of policy 'greedy', choose one of d_optimal"),
@@ -285,7 +286,7 @@ def test_the_usual_value_stands_for_the_policy(stored: Reader) -> None:
     ]
     assert [entry.label for entry in entries] == ["D-optimal", "random"]
     old, new = sorted(stored.configs(), key=lambda one: "fresh" in one.label)[0::2]
-    assert defaults(old)[PATH] == "accumulated"
+    assert usual_values(old.config)[PATH] == "accumulated"
     assert nearness(old) > nearness(new)
 
 

@@ -17,7 +17,7 @@ from analysis.cli import main
 from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import select
 from analysis.report import control_section, write_report
-from analysis.stats.scores import scores_at
+from analysis.stats.scores import scores_at, values_of
 from analysis.style import number
 from analysis.tables.comparisons import compare_policies
 from analysis.tables.variants import (
@@ -306,7 +306,7 @@ def test_what_the_models_are_good_for_has_a_section(tmp_path: Path) -> None:
     assert "| random" not in section  # was not assessed
     with Reader.open(f"sqlite:///{tmp_path}/results.db") as reader:
         costs = {
-            one.config.policy: scores_at(reader, one, 20).by_seed
+            one.config.policy: scores_at(reader, one, 20)
             for one in variant_groups(reader, Filter())[0].variants
             if one.config.config.get("task")
         }
@@ -380,7 +380,7 @@ def test_cells_of_control_are_below_their_own_steps(tmp_path: Path) -> None:
         assert controlled is not None
         text = control_section(controlled)
         table = tabulate_group(opened, found[0]).set_index("variant")
-        costs = scores_at(opened, found[0].variants[1], 10).values
+        costs = values_of(scores_at(opened, found[0].variants[1], 10))
     rows = {row["variant"]: row for row in control_rows(text)}
     assert rows["D-optimal"]["success after 10"] == rows["D-optimal"]["cost after 10"] == "–"
     assert rows["D-optimal"]["success after 20"].startswith("1.00")

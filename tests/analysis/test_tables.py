@@ -267,7 +267,7 @@ def test_the_numbers_follow_from_the_trials(reader: Reader, group: VariantGroup)
     [
         lambda reader, group: control_of(reader, group)["cost"].to_numpy(),
         lambda reader, group: relative_costs(reader, group.reference).values,
-        lambda reader, group: list(scores_at(reader, group.reference, 20).by_seed.items()),
+        lambda reader, group: list(scores_at(reader, group.reference, 20).items()),
         lambda reader, group: list(true_model(reader, group.variants).values()),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -15,10 +16,10 @@ from dopt.assessment import true_forecast
 from dopt.control import Control
 from dopt.control.planning import (
     STARTS,
-    CrossEntropy,
     Episode,
     Forecast,
     costs,
+    cross_entropy,
     forecast_by,
     free_run_error,
     held_out,
@@ -242,8 +243,8 @@ def riccati_plan() -> np.ndarray:
 
 
 def test_the_plan_of_a_linear_system_is_that_of_riccati() -> None:
-    planner = CrossEntropy(gamma=5.0, samples=1000, iterations=60, elites=100)
-    plan = planner.plan(linear_quadratic_cost, np.zeros((HORIZON, 1)), np.random.default_rng(0))
+    planner = partial(cross_entropy, gamma=5.0, samples=1000, iterations=60, elites=100)
+    plan = planner(linear_quadratic_cost, np.zeros((HORIZON, 1)), np.random.default_rng(0))
     best = START @ riccati() @ START
     assert linear_quadratic_cost(riccati_plan()[None])[0] == pytest.approx(best, rel=1e-9)
     assert best <= linear_quadratic_cost(plan[None])[0] <= 1.005 * best
@@ -251,9 +252,9 @@ def test_the_plan_of_a_linear_system_is_that_of_riccati() -> None:
 
 
 def test_a_binding_ball_is_kept_and_used() -> None:
-    planner = CrossEntropy(gamma=1.0, samples=200, iterations=40, elites=20)
+    planner = partial(cross_entropy, gamma=1.0, samples=200, iterations=40, elites=20)
     target = np.array([3.0, 4.0])
-    plan = planner.plan(
+    plan = planner(
         lambda plans: np.sum((plans - target) ** 2, axis=(1, 2)),
         np.zeros((5, 2)),
         np.random.default_rng(1),
@@ -263,19 +264,19 @@ def test_a_binding_ball_is_kept_and_used() -> None:
 
 
 def test_costs_that_overflow_are_the_worst() -> None:
-    planner = CrossEntropy(gamma=1.0, samples=64, iterations=10, elites=8)
+    planner = partial(cross_entropy, gamma=1.0, samples=64, iterations=10, elites=8)
 
     def cost(plans: np.ndarray) -> np.ndarray:
         first = plans[:, 0, 0]
         return np.where(first > 0.2, np.nan, np.where(first < -0.2, -np.inf, -first))
 
-    plan = planner.plan(cost, np.zeros((1, 1)), np.random.default_rng(2))
+    plan = planner(cost, np.zeros((1, 1)), np.random.default_rng(2))
     assert plan[0, 0] == pytest.approx(0.2, abs=0.05)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_no_sequence_that_was_tried_is_better_than_the_plan(seed: int) -> None:
-    planner = CrossEntropy(gamma=1.0, samples=16, iterations=3, elites=8)
+    planner = partial(cross_entropy, gamma=1.0, samples=16, iterations=3, elites=8)
     costs: list[float] = []
 
     def cost(plans: np.ndarray) -> np.ndarray:
@@ -283,10 +284,13 @@ def test_no_sequence_that_was_tried_is_better_than_the_plan(seed: int) -> None:
         costs.extend(found)
         return np.asarray(found)
 
-    plan = planner.plan(cost, np.zeros((3, 2)), np.random.default_rng(seed))
+    plan = planner(cost, np.zeros((3, 2)), np.random.default_rng(seed))
     assert np.cos(7 * plan).sum() == min(costs)
-    optimum, none = np.zeros((3, 2)), CrossEntropy(gamma=1.0, samples=2, iterations=1, elites=1)
-    warm = none.plan(lambda plans: -cost(plans), optimum, np.random.default_rng(seed))
+    optimum, none = (
+        np.zeros((3, 2)),
+        partial(cross_entropy, gamma=1.0, samples=2, iterations=1, elites=1),
+    )
+    warm = none(lambda plans: -cost(plans), optimum, np.random.default_rng(seed))
     assert np.array_equal(warm, optimum), "a start that is the best is kept in sight"
 
 

@@ -21,7 +21,7 @@ from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.policies.base import ClosedLoop, CustomPolicy, Planner
+from dopt.policies.base import CustomPolicy, Planner, Policy
 from dopt.registry import check_importable, source_digest
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec, stored_trial, system_of
@@ -30,7 +30,7 @@ from tests.paths import EXAMPLE
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nameless(ClosedLoop):
+class Nameless(Policy):
     pass
 
 
@@ -80,12 +80,12 @@ def typed(*cells: str, known: bool = True) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Closed(ClosedLoop):
+class Closed(Policy):
     name = "closed"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Thief(ClosedLoop):
+class Thief(Policy):
     name = "random"
 
 

@@ -134,17 +134,18 @@ def test_sections_describe_their_limits() -> None:
     assert spec.limits == Limits(
         bounds=(("y", -0.3, 0.3), ("u", -5.0, 6.0)), rates=(("u", 150.0),), steps=20
     )
-    assert Limits(bounds=(("y", -1, 1),)) == Limits.from_section({"bounds": {"y": (-1, 1)}})
+    assert Limits(bounds=(("y", -1, 1),)) == limited("cartpole", {"bounds": {"y": (-1, 1)}}).limits
     with pytest.raises(SpecificationError, match=r"bounds\.y is \[2\.0, -2\.0\]"):
         Limits(bounds=(("y", 2.0, -2.0),))
-    one_sided = Limits.from_section({"bounds": {"y": [None, np.int64(2)]}})
+    one_sided = limited("cartpole", {"bounds": {"y": [None, np.int64(2)]}}).limits
+    assert one_sided is not None
     assert one_sided.to_section()["bounds"] == {"y": [None, 2.0]}
     assert limited("cartpole", {"name": "none"}).limits is None
     assert "limits" not in limited("cartpole", None).config_json
 
 
 WRONG = [
-    (RAIL | {"margins": 1}, "limits field 'margins' is unknown: did you mean 'margin'"),
+    (RAIL | {"margins": 1}, "limits.box field 'margins' is unknown: did you mean 'margin'"),
     ({"bounds": {"x": [-1, 1]}}, "state or input in limits.bounds 'x' is unknown"),
     ({"bounds": {"y": [1, -1]}}, r"limits\.bounds\.y is \[1, -1\], but a pair of numbers"),
     ({"bounds": {"y": 2.0}}, r"limits\.bounds\.y is 2\.0, but a pair"),
@@ -152,7 +153,7 @@ WRONG = [
     ({"bounds": {"u": [1, 2]}}, r"limits\.bounds\.u is .* but an interval with 0 in it"),
     ({"bounds": [2.0]}, r"limits\.bounds is \[2\.0\], but a mapping of names"),
     ({"rates": {"y": 1.0}}, "input in limits.rates 'y' is unknown"),
-    ({"rates": {"u": 0.0}}, r"limits\.rates\.u is 0\.0, but a positive number"),
+    ({"rates": {"u": 0.0}}, r"limits\.rates\.u is 0\.0, but a number above 0"),
     ({"rates": {"u": True}}, r"limits\.rates\.u is True"),
     (RAIL | {"steps": 0}, r"limits\.steps is 0 steps, but it has to be"),
     (RAIL | {"margin": -1.0}, r"limits\.margin is -1\.0"),
@@ -161,7 +162,7 @@ WRONG = [
     ({"bounds": {"y": [None, None]}}, "limits have neither a bound nor a rate"),
     ({"bounds": 0}, r"limits\.bounds is 0, but a mapping of names"),
     ({"bounds": {"y": [-(10**400), 1]}}, r"limits\.bounds\.y is .* but a pair"),
-    ({"rates": {"u": 10**400}}, r"limits\.rates\.u is .* but a positive number"),
+    ({"rates": {"u": 10**400}}, r"limits\.rates\.u is .* but a number above 0"),
     ("rail", "configuration key 'limits' is 'rail', but a section"),
     ({"name": "sphere"}, "limits 'sphere' is unknown"),
 ]

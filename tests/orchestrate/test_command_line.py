@@ -60,7 +60,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["+env.colour=red"], "'colour' is unknown"),
         (["+results=x"], "setting 'results' is unknown"),  # a word in the usual URL of the store
         (["seed=-1"], "seed is -1"),
-        (["seed=99999999999999999999"], "seed is 9+, but a whole number .* below 2\\^63"),
+        (["seed=99999999999999999999"], "seed is 9+, but a whole number from 0 to 9,223"),
         (["env.horizon=99999999999"], "env.horizon is 9+ steps, .* be from 1 to 2147483647: set"),
         (
             ["policy=random", "policy.regularization=1"],

@@ -14,11 +14,12 @@ import pandas as pd
 import pytest
 
 from analysis.style import steps_text
-from dopt.assessment import parameter_error
+from dopt.assessment import parameter_error, true_parameters
+from dopt.errors import SpecificationError
 from dopt.result import Assessment, TrialResult
 from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems import UnbalancedDisk
+from dopt.systems import SYSTEMS, CoupledPendulums, UnbalancedDisk
 from studies.yardsticks import disk as table_disk
 from studies.yardsticks import pendulums as table_3
 from studies.yardsticks import star as table_star
@@ -158,6 +159,29 @@ def test_samples_are_those_after_which_the_error_stays_small(made: Made) -> None
         above = [t for t, error in zip(steps, errors, strict=True) if error > table_3.ERROR]
         assert row["samples"] == (max(above, default=0) + 1 if errors[-1] <= 0.01 else np.inf)
         assert row["final_error"] == pytest.approx(errors[-1], rel=1e-6)
+
+
+def test_the_loss_of_coupled_pendulums_is_their_parameter_error_times_a_constant() -> None:
+    spec = trial("coupled_pendulums", "oracle", env={"n_pendulums": 3, "grid_half_widths": [2.0]})
+    steps = [1, 10, 30]
+    parameters = rerun(spec, steps).parameters
+    errors = np.array([parameter_error(spec.system, theta) for theta in parameters])
+    losses = run_trial(spec).loss[np.array(steps) - 1]
+    assert losses == pytest.approx(table_3.loss_by_parameter_error(spec.system) * errors, rel=1e-9)
+    assert errors[0] > 100 * errors[-1] > 0
+
+
+def test_systems_whose_loss_is_no_parameter_error_are_refused() -> None:
+    with pytest.raises(SpecificationError, match=r"'pendulum' weighs its parameters differently"):
+        table_3.loss_by_parameter_error(SYSTEMS["pendulum"]())
+    uneven = CoupledPendulums(n_pendulums=2, grid_half_widths=(1.0, 1.1))
+    with pytest.raises(SpecificationError, match=r"dopt\.run"):
+        table_3.loss_by_parameter_error(uneven)
+    object.__setattr__(uneven, "linear_parameters", ())
+    with pytest.raises(SpecificationError, match="no parameters that its accelerations are linear"):
+        true_parameters(uneven)
+    even = dataclasses.replace(uneven, grid_half_widths=(1.0,))
+    assert table_3.loss_by_parameter_error(even) == pytest.approx(1 / 3**0.5, rel=1e-3)
 
 
 def test_medians_and_ratios_of_pendulums_follow_from_the_trials(made: Made) -> None:

@@ -272,9 +272,9 @@ def test_a_test_run_without_an_error_is_not_stored(value: float, tmp_path: Path)
     with explorer() as run:
         drive(run, 5)
         states[3, 0] = inputs[7, 0] = value
-        with pytest.raises(SpecificationError, match=r"states of row 3 .* finite numbers"):
+        with pytest.raises(SpecificationError, match=r"row 3 of the states .* finite numbers"):
             run.save(url, test=(states, INPUTS))
-        with pytest.raises(SpecificationError, match=r"inputs of row 7 .* finite numbers"):
+        with pytest.raises(SpecificationError, match=r"row 7 of the inputs .* finite numbers"):
             run.save(url, test=(STATES, inputs))
         with pytest.raises(SpecificationError, match="in which nothing changes"):
             run.save(url, test=(np.zeros((101, 2)), INPUTS))

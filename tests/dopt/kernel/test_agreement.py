@@ -21,7 +21,7 @@ from dopt.learning.base import Learner
 from dopt.models import MODELS, RFF
 from dopt.models.base import Model
 from dopt.policies import POLICIES, Search
-from dopt.policies.base import ClosedLoop, OpenLoop, Policy
+from dopt.policies.base import OpenLoop, Policy
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.compatibility import REFERENCE_POLICIES
@@ -247,7 +247,7 @@ def test_a_new_policy_or_learner_is_four_files(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize(
     ("base", "more"),
-    [(ClosedLoop, {}), (Learner, {"kernel_function": "dopt.kernel.learners.forgotten"})],
+    [(Policy, {}), (Learner, {"kernel_function": "dopt.kernel.learners.forgotten"})],
 )
 def test_a_kernel_function_that_does_not_exist_is_named(base: Any, more: dict[str, str]) -> None:
     part = type("New", (base,), {"name": "new", "compiled": True, **more})()
