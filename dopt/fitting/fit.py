@@ -283,7 +283,7 @@ class _Selection:
         some = windows.where(np.arange(len(windows.rows)) % every == 0)
         guess, declared = self.delay, self.plant.delay
         keeps_sign = isinstance(declared, Unknown) and declared.factor > 0
-        least = 0.0 if keeps_sign else -2.5 * self.step
+        least = 1e-6 * self.step if keeps_sign else -2.5 * self.step
         latest = declared.at(LATEST) if isinstance(declared, Unknown) else guess
 
         def one(shift: int) -> tuple[float, Model, Solution]:
