@@ -43,8 +43,11 @@ OF_INPUT = 0.002
 BETWEEN = 0.3
 """Share of what is left open between jumps, above which these hide the feedback, however small."""
 
-PREDICTED = 0.9999
-"""Share of an input that its past tells, above which feedback is not told apart."""
+PREDICTED, ROUNDED = 0.9999, 1.0 - 1e-9
+"""Shares of an input that its past tells, above which feedback is not told apart, or a sure one."""
+
+SURE = 0.9
+"""Share of what is left open; of a regular input the motion, which is as regular, has up to .8."""
 
 FAR = 7.5
 """What an input's past leaves open of a row, by its median, above which it jumps there."""
@@ -113,7 +116,8 @@ class Effect:
         """Whether the input answers to the measurements."""
         is_large = self.feedback * (1.0 - self.predicted) > OF_INPUT
         feedback = self.feedback > (FEEDBACK if is_large else BETWEEN)
-        return self.follows_state or (feedback and self.predicted < PREDICTED)
+        most = ROUNDED if self.feedback > SURE else PREDICTED
+        return self.follows_state or (feedback and self.predicted < most)
 
 
 def effects(log: Log) -> list[Effect]:
@@ -336,11 +340,10 @@ def _causal(piece: Piece, j: int) -> tuple[Vector, Array, Array]:
 
 def _usual(features: Array, values: Vector) -> Booleans:
     """Return the rows that features tell about as well as they tell most of these rows."""
-    scaled = features / np.maximum(np.sqrt((features**2).mean(axis=0)), 1e-300)
     kept = np.ones(len(values), np.bool_)
     for _ in range(_TRIMMED):
-        told = np.linalg.lstsq(scaled[kept], values[kept], rcond=1e-12)[0]
-        rest = np.abs(values - scaled @ told)
+        told = np.linalg.lstsq(features[kept], values[kept], rcond=1e-12)[0]
+        rest = np.abs(values - features @ told)
         far = rest > FAR * np.median(rest[kept]) + 1e-12 * np.abs(values).max()
         if (far != kept).all():
             break

@@ -20,7 +20,7 @@ import functools
 import logging
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Array
-
-if TYPE_CHECKING:
-    from dopt.explorer.state import InFlight
 
 SIGNS = {
     "unmoved": "stretches of 100 learned steps in which no parameter moved",
@@ -144,7 +141,7 @@ class Exploration(Protocol):
     @property
     def steps(self) -> Steps: ...
     @property
-    def flight(self) -> InFlight: ...
+    def waiting(self) -> Array: ...
 
 
 class Signs:
@@ -181,7 +178,7 @@ class Signs:
             state.counts["beyond"] += 1
             if limits.enforced:
                 self._say("beyond", state.excess[done - 1], done)
-        self._steps.append((self._start, seconds, event["learn"], state.flight.waiting))
+        self._steps.append((self._start, seconds, event["learn"], state.waiting))
         self._starts.append(self._start)
         if done % BLOCK == 0:
             self._end_block(state)

@@ -442,6 +442,11 @@ class ExplorerState:
         """The input that it chose, (m,), as far as the supply can apply it."""
         return self.flight.cut(self.steps.inputs[self.done] * self._scaled.inputs)
 
+    @property
+    def waiting(self) -> Array:
+        """Inputs that do not act yet, (n, m), the newest first."""
+        return self.flight.waiting
+
     def _hold_input(self, time: float | None) -> None:
         """Move inputs in flight on to a state that did not follow within about dt.
 

@@ -94,6 +94,9 @@ LOWEST_CUT = 0.4
 LEAST_FALL, SURE_FALL = 0.1, 1.0 / 3.0
 """Falls of what is minimised, by itself, from which a supply is looked for, and is beyond doubt."""
 
+SURELY = 9.0
+"""Fall of what is minimised, of squares of standard errors, that chance does not explain."""
+
 STEP_ERROR = 0.3
 """Largest error of the integration that goes unsaid, in standard deviations of what is left."""
 
@@ -182,8 +185,9 @@ def fit(
     physics = work.finish(work.model, work.solution, 1.0)
     chosen = work.finish(*network) if network else physics
     work.check_steps(chosen)
-    if hold == "linear" and physics.model.names:
-        work.check_hold(physics, data_of(plant, runs, "cubic"))
+    other = {"zero": "linear", "linear": "cubic"}.get(hold)
+    if other and physics.model.names:
+        work.check_hold(physics, other, data_of(plant, runs, other))
     held_out = work.held_out()
     return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
 
@@ -279,7 +283,7 @@ class _Selection:
         some = windows.where(np.arange(len(windows.rows)) % every == 0)
         guess, declared = self.delay, self.plant.delay
         keeps_sign = isinstance(declared, Unknown) and declared.factor > 0
-        least = 0.0 if keeps_sign else -2.5 * self.step
+        least = 1e-6 * self.step if keeps_sign else -2.5 * self.step
         latest = declared.at(LATEST) if isinstance(declared, Unknown) else guess
 
         def one(shift: int) -> tuple[float, Model, Solution]:
@@ -504,21 +508,22 @@ class _Selection:
                 f"smaller dt, or softer corners, such as tanh(rate / 0.5) for tanh(rate / 0.05)"
             )
 
-    def check_hold(self, found: Estimate, curved: Data) -> None:
-        """Note it where constants are others with a curve through the inputs in place of lines."""
-        (model, solution, s, covariance), steps = found, []
-        weights = 1.0 / (1.0 + solution.squares / solution.scale) / s**2
-        for data in (self.data, curved._replace(deviations=self.data.deviations)):
-            linear = Simulator(model, data).linear(solution.p, solution.windows, weights)
-            slope = linear.slope - (solution.p - model.prior)
-            steps.append(np.linalg.solve(linear.normal + np.eye(model.q), slope))
-        moved = np.abs(np.subtract(*steps)) / np.sqrt(np.diag(covariance))
+    def check_hold(self, found: Estimate, other: str, data: Data) -> None:
+        """Note it where constants are others if inputs are interpolated in another way."""
+        (model, before, s, covariance), windows = found, found.solution.windows
+        pieces = np.searchsorted(np.unique(self.data.firsts), windows.rows, side="right") - 1
+        parts = round((len(data.time) - 1) / (len(self.data.time) - 1))
+        windows = windows._replace(rows=parts * windows.rows - (parts - 1) * pieces)
+        simulator = Simulator(model, data._replace(deviations=self.data.deviations))
+        after = solve(simulator, windows, before.p, s, most=8, scale=before.scale)
+        moved = np.abs(after.p - before.p) / np.sqrt(np.diag(covariance))
         most = int(np.argmax(moved))
-        if moved[most] > 1.0:
+        fall = before.cost(model, s) - after.cost(model, s)
+        if moved[most] > 1.0 and fall > SURELY:
             self.notes.append(
-                f"a smooth curve through the inputs in place of lines moves {model.names[most]} by "
-                f"{moved[most]:.2g} standard errors, which contain none of it: take hold='cubic' "
-                f"if they are smooth, or record them more often"
+                f"hold={other!r} fits better, and moves {model.names[most]} by {moved[most]:.2g} "
+                f"standard errors, which contain none of it: take it if inputs were measured"
+                f"{' and are smooth' * (other == 'cubic')}, or record them more often"
             )
 
 

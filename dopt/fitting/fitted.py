@@ -153,14 +153,9 @@ class Fitted:
     @property
     def given(self) -> dict[str, float]:
         """Constants that were not fitted, and the delay and the lag where they were given."""
-        plant = self.plant
-        known = {name: v for name, v in plant.constants.items() if not isinstance(v, Unknown)}
-        known |= {
-            name: value
-            for name, value in (("delay", plant.delay), ("lag", plant.lag))
-            if not isinstance(value, Unknown) and value and name not in plant.constants
-        }
-        return {name: float(value) for name, value in known.items()}
+        times, known = {"delay": self.plant.delay, "lag": self.plant.lag}, {**self.plant.constants}
+        known |= {name: v for name, v in times.items() if v and name not in known}
+        return {name: float(v) for name, v in known.items() if not isinstance(v, Unknown)}
 
     @property
     def delay(self) -> float:
@@ -480,8 +475,8 @@ class Fitted:
         history = 0.5 * self.selection.window if history is None else float(history)
         for first in np.unique(data.firsts):
             last, begin = int(data.lasts[first]), int(first)
-            while begin < last and data.time[begin] - data.time[first] < self._latest():
-                begin += 1
+            elapsed = data.time[first:last] - data.time[first]
+            begin += int(np.searchsorted(elapsed, self._latest()))
             middle = begin + int(
                 np.searchsorted(data.time[begin : last + 1], data.time[begin] + history)
             )

@@ -75,7 +75,9 @@ def test_a_delay_is_found_in_open_loop(seed: int, delay: int) -> None:
     assert effect.delays == (delay, delay)
     u, ramps = held(rng, 2000), np.cumsum(held(rng, 2000)) / 100
     seen = u + 0.01 * rng.normal(size=2000)
-    for given, logged in ((u, seen), (ramps, ramps)):
+    times = rng.uniform(0.05, 10, (10, 1)) * np.arange(2000) * DT
+    tones = np.sin(2 * np.pi * times + rng.uniform(0, 6, (10, 1))).sum(axis=0)
+    for given, logged in ((u, seen), (ramps, ramps), (tones, tones)):
         assert not one_effect(motor(given, delay=delay), logged).closed_loop
 
 
@@ -121,16 +123,16 @@ def test_an_arm_that_is_moved_by_hand_is_said_to_explain_nothing(seed: int) -> N
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("jumps", [False, True])
+@pytest.mark.parametrize(("jumps", "step"), [(False, 0.003), (True, 0.003), (True, 1e-4)])
 def test_feedback_is_found_although_a_signal_or_a_set_point_is_added(
-    seed: int, jumps: bool
+    seed: int, jumps: bool, step: float
 ) -> None:
     """The jumps of a set point were all that was left to tell, and called open loop."""
     rng = np.random.default_rng(seed)
     signal = np.repeat(rng.uniform(-3, 3, 10), 300) if jumps else 0.3 * smooth(rng, 3000)
     angle, speed, seen, u = 0.0, 0.0, [0.0], []
     for k in range(3000):
-        seen.append(round(angle / 0.003) * 0.003)
+        seen.append(round(angle / step) * step)
         u.append(-2 * seen[-1] - 5 * (seen[-1] - seen[-2]) + signal[k])
         a = 40 * u[-1] - 5 * speed + 8 * np.sin(angle)
         angle, speed = angle + DT * speed + 0.5 * DT**2 * a, speed + DT * a

@@ -267,6 +267,7 @@ def test_constants_and_delay_lie_within_their_errors(seed: int) -> None:
         estimate, error = found.constants[name]
         assert abs(estimate - value) < 5 * error + 2e-3 * abs(value), (name, estimate, error)
     assert not found.has_network
+    assert "fits better, and moves" not in found.report()
 
 
 def test_standard_errors_are_of_fits_without_each_window() -> None:
@@ -420,9 +421,11 @@ def test_a_delay_keeps_its_prior_as_other_constants_do() -> None:
         assert found.constants["delay"][0] == pytest.approx(0.05, rel=0.01)
 
 
-@pytest.mark.parametrize("hold", ["linear", "cubic"])
-def test_what_a_smooth_input_does_between_rows_is_said(hold: str) -> None:
-    """A mass on a spring over a road; by lines the spring was 20 errors off without a word."""
+@pytest.mark.parametrize(
+    ("hold", "better"), [("zero", "linear"), ("linear", "cubic"), ("cubic", "")]
+)
+def test_what_a_smooth_input_does_between_rows_is_said(hold: str, better: str) -> None:
+    """A mass on a spring over a road, of which constants were far off without a word."""
     rng, t = np.random.default_rng(0), np.arange(4000.0) * 0.01
     frequencies, phases = rng.uniform(0.5, 6, 12), rng.uniform(0, 6, 12)
 
@@ -450,7 +453,8 @@ def test_what_a_smooth_input_does_between_rows_is_said(hold: str) -> None:
     off = max(
         abs(found.constants[name][0] - v) / found.constants[name][1] for name, v in errors.items()
     )
-    assert (off > 5) == ("take hold='cubic'" in found.report()) == (hold == "linear")
+    assert (off > 5) == ("fits better, and moves" in found.report()) == bool(better)
+    assert (f"hold='{better}' fits better" in found.report()) == bool(better)
 
 
 def test_units_of_a_state_do_not_matter() -> None:
