@@ -2,7 +2,7 @@
 
 Motions begin and end at rest. Multisines and Fourier series: J. Swevers et al., "Optimal robot
 excitation and identification", IEEE Trans. Robotics and Automation 13, 5 (1997). Ladders move each
-joint by segments of constant speed.
+joint by segments of constant speed. Splines take any shape, which is improved step by step.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import math
 from abc import ABC, abstractmethod
 
 import numpy as np
+from scipy.interpolate import BSpline
+from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.special import ndtr
 
 from dopt.robots.body import Motion
@@ -32,6 +34,9 @@ SEGMENT = 0.5
 
 HARMONICS = 10
 """Harmonics of a Fourier series."""
+
+KNOT, LEAST = 0.2, 12
+"""Seconds between two knots of a spline, and its segments at the least."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,6 +210,110 @@ class Ladder(Family):
             columns.append(path.sampled(t))
         q, v, a = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
         return Motion(dt, q, v, a)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spline(Family):
+    """Cubic spline of each joint: numbers are its control points, the first and the last at rest.
+
+    Its positions, velocities and accelerations lie between its control points and their
+    differences, so that limits are linear in the numbers.
+    """
+
+    name = "spline"
+
+    @property
+    def _count(self) -> int:
+        """Control points that are free: three more at either end repeat it."""
+        return max(LEAST, round(self.seconds / KNOT)) - 3
+
+    @property
+    def size(self) -> int:
+        return self.n * self._count
+
+    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
+        q, v, a = self._sampled(numbers.reshape(self._count, self.n), dt)
+        middle = self.limits.middle
+        return Motion(dt, middle + reach * (q - middle), reach * v, reach * a)
+
+    def basis(self, dt: float) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations by the control points, (T, m) each."""
+        return self._sampled(np.eye(self._count), dt)
+
+    def _sampled(self, points: Array, dt: float) -> tuple[Array, Array, Array]:
+        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        knots = self._knot * np.arange(-3.0, len(points) + 7.0)
+        spline = BSpline(knots, self._repeated(points), 3)
+        return spline(t), spline.derivative()(t), spline.derivative(2)(t)
+
+    @property
+    def _knot(self) -> float:
+        return self.seconds / (self._count + 3)
+
+    def _repeated(self, points: Array) -> Array:
+        last = self._count - 1
+        result: Array = points[np.clip(np.arange(-3, last + 4), 0, last)]
+        return result
+
+    def _rates(self) -> tuple[Array, Array]:
+        """Return velocities and accelerations between control points, (m + 5, m), (m + 4, m)."""
+        points = self._repeated(np.eye(self._count))
+        return np.diff(points, axis=0) / self._knot, np.diff(points, 2, axis=0) / self._knot**2
+
+    def shortened(self, numbers: Array, reach: float) -> Array:
+        """Return the numbers of a motion that reaches as far as some do with a share of it."""
+        away = numbers.reshape(self._count, self.n) - self.limits.middle
+        result: Array = self.limits.middle + reach * away
+        return result.ravel()
+
+    def nearest(self, motion: Motion) -> Array:
+        """Return the numbers of a motion by least squares; joints shrink into their limits."""
+        points = np.linalg.lstsq(self.basis(motion.dt)[0], motion.positions, rcond=None)[0]
+        limits, (first, second) = self.limits, self._rates()
+        away = points - limits.middle
+        taken = np.max(
+            [
+                np.abs(away).max(axis=0) / (np.ptp(limits.position, axis=1) / 2.0),
+                np.abs(first @ points).max(axis=0) / limits.velocity,
+                np.abs(second @ points).max(axis=0) / limits.acceleration,
+            ],
+            axis=0,
+        )
+        result: Array = limits.middle + away / np.maximum(taken / ROOM, 1.0)
+        return result.ravel()
+
+    def ascent(self, numbers: Array, slopes: Array, radius: float) -> Array:
+        """Return the numbers within the limits that maximise a linear function.
+
+        Parameters
+        ----------
+        numbers : (size,)
+            Where it is linear.
+        slopes : (m, n)
+            Its derivatives by the control points.
+        radius : float
+            Share of its range of position by which a control point may change.
+        """
+        points, limits = numbers.reshape(self._count, self.n), self.limits
+        found = points.copy()
+        first, second = self._rates()
+        for k, (low, high) in enumerate(limits.position):
+            half, most = ROOM * (high - low) / 2.0, radius * (high - low)
+            largest = np.repeat(
+                ROOM * np.array([limits.velocity[k], limits.acceleration[k]]),
+                [len(first), len(second)],
+            )
+            program = milp(
+                -slopes[:, k],
+                bounds=Bounds(
+                    np.maximum(limits.middle[k] - half, points[:, k] - most),
+                    np.minimum(limits.middle[k] + half, points[:, k] + most),
+                ),
+                constraints=LinearConstraint(np.vstack([first, second]), -largest, largest),
+            )
+            if program.x is not None:  # rounding alone lets none be found
+                found[:, k] = program.x
+        return found.ravel()
 
 
 class JointPath:
