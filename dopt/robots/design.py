@@ -42,8 +42,8 @@ DRAWN = 24
 EFFORT = 40
 """Splines that are tried unless told otherwise."""
 
-RADIUS, WIDEST = 0.1, 0.3
-"""Share of the ranges of position by which a spline first changes, and the most that it may."""
+RADIUS, WIDEST, NARROWEST = 0.1, 0.3, 0.002
+"""Share of the ranges of position by which a spline first changes; the most, and the least."""
 
 STEP = 1e-4
 """Step of positions [rad or m], and share of the limits of rates, for derivatives."""
@@ -53,6 +53,9 @@ ABOVE = 1.1
 
 FLOOR = 3.0
 """Weight of the logarithm by which the worst error exceeds its reference."""
+
+SHARP = 20.0
+"""How much an error below the worst one counts less in the slope of the penalty."""
 
 LEAST = 0.1
 """Share of its scale that an unknown parameter is at the least, where torques are linearised.
@@ -346,21 +349,20 @@ def improved(
     nothing stands against it.
     """
     spline = Spline(problem.limits, problem.seconds)
-    coarse = 2.0 * problem.step
-    basis = spline.basis(coarse)
+    basis = spline.basis(problem.step)
     best = problem.candidate(spline, spline.nearest(begun.motion(problem.step)))
     radius, slopes = RADIUS, None
     for _ in range(effort):
         if slopes is None:
             points = spline.shortened(best.numbers, best.reach)
-            parts = zip(basis, gradient(problem, best.motion(coarse)), strict=True)
+            parts = zip(basis, gradient(problem, best.motion(problem.step)), strict=True)
             slopes = np.sum([of.T @ by for of, by in parts], axis=0)
         one = problem.candidate(spline, spline.ascent(points, slopes, radius))
         if one.score < best.score and not problem.obstacle(one):
             best, slopes, radius = one, None, min(1.5 * radius, WIDEST)
-        else:
-            radius *= 0.4
-    progress(f"{spline.name}, {effort} motions: {_said(best)}")
+        elif (radius := 0.4 * radius) < NARROWEST:
+            break
+    progress(f"{spline.name}, from {begun.name}: {_said(best)}")
     return best
 
 
@@ -373,10 +375,11 @@ def gradient(problem: Problem, motion: Motion) -> list[Array]:
     errors = problem.errors(information)
     information += np.eye(len(unknowns))
     weights = 0.5 / problem.count * _by_information(information, problem.count)
-    worst = int(np.argmax(errors / problem.reference))
-    if errors[worst] > problem.reference[worst]:
-        column = np.linalg.inv(information)[:, worst] / errors[worst]
-        weights += 0.5 * FLOOR * np.outer(column, column)
+    above = np.log(errors / problem.reference)
+    if above.max() > 0.0:
+        columns = np.linalg.inv(information)[:, : problem.count] / errors
+        shares = np.exp(SHARP * (above - above.max()))
+        weights += 0.5 * FLOOR / shares.sum() * (columns * shares) @ columns.T
     now, found = _values(rows, weights), []
     parts = [motion.positions, motion.velocities, motion.accelerations]
     scales = [np.ones(n), problem.limits.velocity, problem.limits.acceleration]

@@ -14,6 +14,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csr_array, vstack
+from scipy.sparse.linalg import spsolve
 from scipy.special import ndtr
 
 from dopt.robots.body import Motion
@@ -232,33 +234,34 @@ class Spline(Family):
         return self.n * self._count
 
     def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
-        q, v, a = self._sampled(numbers.reshape(self._count, self.n), dt)
-        middle = self.limits.middle
+        points, middle = numbers.reshape(self._count, self.n), self.limits.middle
+        q, v, a = (of @ points for of in self.basis(dt))
         return Motion(dt, middle + reach * (q - middle), reach * v, reach * a)
 
-    def basis(self, dt: float) -> tuple[Array, Array, Array]:
+    def basis(self, dt: float) -> tuple[csr_array, csr_array, csr_array]:
         """Return positions, velocities and accelerations by the control points, (T, m) each."""
-        return self._sampled(np.eye(self._count), dt)
-
-    def _sampled(self, points: Array, dt: float) -> tuple[Array, Array, Array]:
         t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
-        knots = self._knot * np.arange(-3.0, len(points) + 7.0)
-        spline = BSpline(knots, self._repeated(points), 3)
-        return spline(t), spline.derivative()(t), spline.derivative(2)(t)
+        knots = self._knot * np.arange(-3.0, self._count + 7.0)
+        first, second = self._rates()
+        return (
+            BSpline.design_matrix(t, knots, 3) @ self._repeated(),
+            BSpline.design_matrix(t, knots[1:-1], 2) @ first,
+            BSpline.design_matrix(t, knots[2:-2], 1) @ second,
+        )
 
     @property
     def _knot(self) -> float:
         return self.seconds / (self._count + 3)
 
-    def _repeated(self, points: Array) -> Array:
-        last = self._count - 1
-        result: Array = points[np.clip(np.arange(-3, last + 4), 0, last)]
-        return result
+    def _repeated(self) -> csr_array:
+        rows, last = np.arange(self._count + 6), self._count - 1
+        return csr_array((np.ones(len(rows)), (rows, np.clip(rows - 3, 0, last))))
 
-    def _rates(self) -> tuple[Array, Array]:
+    def _rates(self) -> tuple[csr_array, csr_array]:
         """Return velocities and accelerations between control points, (m + 5, m), (m + 4, m)."""
-        points = self._repeated(np.eye(self._count))
-        return np.diff(points, axis=0) / self._knot, np.diff(points, 2, axis=0) / self._knot**2
+        points = self._repeated()
+        first = (points[1:] - points[:-1]) / self._knot
+        return first, (first[1:] - first[:-1]) / self._knot
 
     def shortened(self, numbers: Array, reach: float) -> Array:
         """Return the numbers of a motion that reaches as far as some do with a share of it."""
@@ -268,7 +271,9 @@ class Spline(Family):
 
     def nearest(self, motion: Motion) -> Array:
         """Return the numbers of a motion by least squares; joints shrink into their limits."""
-        points = np.linalg.lstsq(self.basis(motion.dt)[0], motion.positions, rcond=None)[0]
+        basis, *_ = self.basis(motion.dt)
+        points = spsolve((basis.T @ basis).tocsc(), basis.T @ motion.positions)
+        points = points.reshape(-1, self.n)
         limits, (first, second) = self.limits, self._rates()
         away = points - limits.middle
         taken = np.max(
@@ -297,19 +302,18 @@ class Spline(Family):
         points, limits = numbers.reshape(self._count, self.n), self.limits
         found = points.copy()
         first, second = self._rates()
+        rates, counts = vstack([first, second]), [first.shape[0], second.shape[0]]
         for k, (low, high) in enumerate(limits.position):
             half, most = ROOM * (high - low) / 2.0, radius * (high - low)
-            largest = np.repeat(
-                ROOM * np.array([limits.velocity[k], limits.acceleration[k]]),
-                [len(first), len(second)],
-            )
+            sizes = ROOM * np.array([limits.velocity[k], limits.acceleration[k]])
+            largest = np.repeat(sizes, counts)
             program = milp(
                 -slopes[:, k],
                 bounds=Bounds(
                     np.maximum(limits.middle[k] - half, points[:, k] - most),
                     np.minimum(limits.middle[k] + half, points[:, k] + most),
                 ),
-                constraints=LinearConstraint(np.vstack([first, second]), -largest, largest),
+                constraints=LinearConstraint(rates, -largest, largest),
             )
             if program.x is not None:  # rounding alone lets none be found
                 found[:, k] = program.x
