@@ -73,7 +73,6 @@ class Candidate:
 
     Attributes
     ----------
-    name : str
     family : Family
     numbers : (size,)
         What :meth:`Family.motion` makes it of.
@@ -91,7 +90,6 @@ class Candidate:
         Share of the attainable information about them, for each of them; 0 until it is known.
     """
 
-    name: str
     family: Family
     numbers: Array
     reach: float
@@ -100,6 +98,10 @@ class Candidate:
     broken: float
     score: float
     share: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.family.name
 
     @property
     def free(self) -> bool:
@@ -207,7 +209,7 @@ class Problem:
         broken += 0.5 + len(touching) / len(looked) if touching else 0.0
         information = self.tangent.information(motion, self.rate, rigid)
         found = self.determinant(information), self.errors(information), broken
-        return Candidate(family.name, family, numbers, reach, *found, self.score(*found))
+        return Candidate(family, numbers, reach, *found, self.score(*found))
 
     def obstacle(self, one: Candidate) -> str:
         """Say which torque is too large or which bodies touch at finer steps; "" if none do."""

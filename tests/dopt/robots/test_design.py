@@ -38,13 +38,12 @@ def test_motions_keep_limits_begin_and_end_at_rest_and_are_integrals(
     limits: Limits, seed: int, seconds: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    spline = Spline(limits, seconds)
-    for family in (*families(limits, seconds), spline):
-        numbers = 2.0 * rng.standard_normal(family.size)
-        if family is spline:
-            for radius in (0.1, 0.3):
-                begun = spline.nearest(motion) if radius < 0.2 else numbers
-                numbers = spline.ascent(begun, rng.standard_normal((len(begun) // 4, 4)), radius)
+    tried = [(one, 2.0 * rng.standard_normal(one.size)) for one in families(limits, seconds)]
+    spline, (drawn, numbers) = Spline(limits, seconds), tried[seed % len(tried)]
+    points = spline.nearest(drawn.motion(numbers, 0.04))
+    for radius in (0.1, 0.3):
+        points = spline.ascent(points, rng.standard_normal((points.size // 4, 4)), radius)
+    for family, numbers in (*tried, (spline, points)):
         motion = family.motion(numbers, 0.002)
         shares = limits.shares(motion)
         assert max(shares.values()) <= ROOM + 1e-9, (family.name, shares)
