@@ -204,7 +204,7 @@ def main() -> None:
                 limits = Limits(limits.position, limits.velocity, possible, limits.torque)
             one = row(arm, body, limits, seed, given.effort)
             with FILE.open("a", newline="") as file:
-                writer = csv.DictWriter(file, one)
+                writer = csv.DictWriter(file, one, lineterminator="\n")
                 if not file.tell():
                     writer.writeheader()
                 writer.writerow(

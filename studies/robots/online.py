@@ -306,7 +306,7 @@ def main() -> None:
         arms["iiwa"] = iiwa(given.urdf, given.limits)
     fresh = not given.out.exists()
     with given.out.open("a", newline="") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         if fresh:
             writer.writerow([field.name for field in dataclasses.fields(Row)])
         for name, (body, limits) in arms.items():
