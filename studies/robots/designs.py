@@ -35,6 +35,12 @@ OFF = 0.1
 WINDOW = 31
 """Samples of a local cubic: 62 ms."""
 
+FAR = 1.5
+"""Errors by expected ones that count as too large."""
+
+TURNING = 3.0
+"""Multiple of the width of dry friction's sign below which rates tell too little of the sign."""
+
 KNOWN = 0.3
 """Share of the prior standard deviation below which an expected error is compared with a fit's."""
 
@@ -117,6 +123,7 @@ def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
     prior = np.eye(len(found)) / OFF**2
     slow = SLOW * problem.limits.velocity
     noise = first.noise * problem.limits.torque / np.sqrt(problem.rate * CONTROL)
+    moving = np.abs(planned.velocities) > TURNING * slow
     for _ in range(3):
         values, slopes = values_of(first, found)
         unknowns, gears = first.at(values)
@@ -124,14 +131,22 @@ def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
         damping, dry = body.model.dof_damping[body.dofs], body.model.dof_frictionloss[body.dofs]
         v = motion.velocities
         expected = body.torques(motion) + damping * v + dry * np.tanh(v / slow)
-        scale = 1.0 / (gears * noise)[:, None]
+        scale = (moving / (gears * noise))[:, :, None]
         x, z = (
             (unknowns.regressor(one) * scale).reshape(-1, len(found)) * slopes
             for one in (motion, planned)
         )
-        left = ((commands - expected / gears) / noise).reshape(-1)
+        left = (moving * (commands - expected / gears) / noise).reshape(-1)
         found = found + np.linalg.solve(z.T @ x + prior, z.T @ left - prior @ found)
     return found
+
+
+def chance(covariance: Array) -> float:
+    """Return how often the root mean square of errors by expected ones exceeds :data:`FAR`."""
+    sizes = np.sqrt(np.diag(covariance))
+    spread = np.linalg.eigvalsh(covariance / np.outer(sizes, sizes)) / len(sizes)
+    squares = np.random.default_rng(0).standard_normal((10000, len(sizes))) ** 2 @ spread
+    return float((squares > FAR**2).mean())
 
 
 def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[str, object]:
@@ -162,8 +177,10 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
     rows = measured(robot, body, gears, motion)
     rows[:, 1] += problem.unknowns.noise * limits.torque * rng.standard_normal(rows[:, 1].shape)
     # Errors that are expected with the prior of the fit, as shares of its standard deviation.
-    shares = relative_errors(OFF**2 * problem.information(best.motion(COARSE)))
-    z = ((fitted(problem, rows, motion) - off) / (OFF * shares))[shares < KNOWN]
+    information = OFF**2 * problem.information(best.motion(COARSE))
+    shares = relative_errors(information)
+    told = shares < KNOWN
+    z = ((fitted(problem, rows, motion) - off) / (OFF * shares))[told]
     return {
         "arm": arm,
         "seed": seed,
@@ -178,6 +195,7 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
         "fitted": len(z),
         "achieved": float(np.sqrt((z**2).mean())),
         "achieved_worst": float(np.abs(z).max()),
+        "chance": chance(np.linalg.inv(information + np.eye(len(off)))[np.ix_(told, told)]),
         "cpu_seconds": spent,
     }
 
