@@ -426,7 +426,7 @@ def attainable(problem: Problem, rng: np.random.Generator) -> tuple[float, float
 
 def _by_information(information: Array, s: int) -> Array:
     """Return the derivative of D_s by the information, (p, p)."""
-    inverse: Array = np.linalg.inv(information)
+    inverse = np.array(np.linalg.inv(information), dtype=float)
     inverse[s:, s:] -= np.linalg.inv(information[s:, s:])
     return inverse
 

@@ -20,7 +20,7 @@ from scipy.signal import savgol_filter
 from dopt.robots.body import Body, KnownBody, Motion
 from dopt.robots.design import COARSE, EFFORT, Design, Problem
 from dopt.robots.limits import Limits
-from dopt.robots.parameters import SLOW, Identifiability, Unknowns, relative_errors
+from dopt.robots.parameters import SLOW, Identifiability, Unknowns
 from dopt.robots.tracking import Tracker, possible_acceleration
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, LIMITS, Friction, SimulatedRobot, iiwa, jaco
@@ -178,7 +178,8 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
     rows[:, 1] += problem.unknowns.noise * limits.torque * rng.standard_normal(rows[:, 1].shape)
     # Errors that are expected with the prior of the fit, as shares of its standard deviation.
     information = OFF**2 * problem.information(best.motion(COARSE))
-    shares = relative_errors(information)
+    covariance = np.array(np.linalg.inv(information + np.eye(len(off))), dtype=float)
+    shares = np.sqrt(np.diag(covariance))
     told = shares < KNOWN
     z = ((fitted(problem, rows, motion) - off) / (OFF * shares))[told]
     return {
@@ -195,7 +196,7 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
         "fitted": len(z),
         "achieved": float(np.sqrt((z**2).mean())),
         "achieved_worst": float(np.abs(z).max()),
-        "chance": chance(np.linalg.inv(information + np.eye(len(off)))[np.ix_(told, told)]),
+        "chance": chance(covariance[np.ix_(told, told)]),
         "cpu_seconds": spent,
     }
 
