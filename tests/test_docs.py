@@ -195,7 +195,7 @@ def test_every_command_on_results_works(
         pytest.importorskip("mujoco", reason="needs MuJoCo")
         (tmp_path / "arm.xml").write_text(ROBOT.replace("upper", "link7").replace("lower", "hand"))
         (tmp_path / "limits.yaml").write_text(LIMITS)
-        words += () if "--check" in words else ("--effort", "24", "--seconds", "2")
+        words += () if "--check" in words else ("--effort", "2", "--seconds", "2")
     assert typed(Command(command.page, {}, "orchestrate", words))
 
 

@@ -159,7 +159,13 @@ class Body:
     @property
     def inertial(self) -> Array:
         """Inertial parameters of the moved bodies, (10 · bodies,)."""
-        return np.concatenate([self._inertial_of(b) for b in self.moved])
+        rows, model = [], self.model
+        for b in self.moved:
+            m, c, axes = model.body_mass[b], model.body_ipos[b], rotation(model.body_iquat[b])
+            about_com = axes @ np.diag(model.body_inertia[b]) @ axes.T
+            about = about_com + m * (c @ c * np.eye(3) - np.outer(c, c))
+            rows.append(inertial_row(m, m * c, about))
+        return np.concatenate(rows)
 
     @property
     def home(self) -> Array:
@@ -182,13 +188,6 @@ class Body:
         around = self.home[:, None] + free[:, None] * [-1.0, 1.0]
         result: Array = np.where(limited[:, None], self.model.jnt_range[self._ids], around)
         return result
-
-    def _inertial_of(self, b: int) -> Array:
-        model = self.model
-        m, c = float(model.body_mass[b]), np.array(model.body_ipos[b])
-        axes = rotation(model.body_iquat[b])
-        about_com = axes @ np.diag(model.body_inertia[b]) @ axes.T
-        return inertial_row(m, m * c, about_com + m * (c @ c * np.eye(3) - np.outer(c, c)))
 
     def regressor(self, motion: Motion) -> Array:
         """Return how torques depend on the inertial parameters, (T, n, 10 · bodies).

@@ -21,7 +21,7 @@ from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Parameter, Unknowns, count_null, relative_errors
-from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
+from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine, Spline
 from dopt.types import Array
 
 COARSE = 0.04
@@ -36,14 +36,26 @@ REFERENCES = 25
 PERIODS = (2.0, 5.0, 10.0, 20.0)
 """Periods of the Fourier series that are tried [s]."""
 
-BEGUN, CHANGED, KEPT = 24, (0.03, 0.1, 0.3), 0.7
-"""Motions that begin a search, shares of the numbers that it changes, and their correlation."""
+DRAWN = 24
+"""Random motions of each other family."""
+
+EFFORT = 40
+"""Splines that are tried unless told otherwise."""
+
+RADIUS, WIDEST, NARROWEST = 0.1, 0.3, 0.002
+"""Share of the ranges of position by which a spline first changes; the most, and the least."""
+
+STEP = 1e-4
+"""Step of positions [rad or m], and share of the limits of rates, for derivatives."""
 
 ABOVE = 1.1
 """Error by its reference above which a penalty begins."""
 
 FLOOR = 3.0
 """Weight of the logarithm by which the worst error exceeds its reference."""
+
+SHARP = 20.0
+"""How much an error below the worst one counts less in the slope of the penalty."""
 
 LEAST = 0.1
 """Share of its scale that an unknown parameter is at the least, where torques are linearised.
@@ -61,7 +73,6 @@ class Candidate:
 
     Attributes
     ----------
-    name : str
     family : Family
     numbers : (size,)
         What :meth:`Family.motion` makes it of.
@@ -79,7 +90,6 @@ class Candidate:
         Share of the attainable information about them, for each of them; 0 until it is known.
     """
 
-    name: str
     family: Family
     numbers: Array
     reach: float
@@ -88,6 +98,10 @@ class Candidate:
     broken: float
     score: float
     share: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.family.name
 
     @property
     def free(self) -> bool:
@@ -195,7 +209,7 @@ class Problem:
         broken += 0.5 + len(touching) / len(looked) if touching else 0.0
         information = self.tangent.information(motion, self.rate, rigid)
         found = self.determinant(information), self.errors(information), broken
-        return Candidate(family.name, family, numbers, reach, *found, self.score(*found))
+        return Candidate(family, numbers, reach, *found, self.score(*found))
 
     def obstacle(self, one: Candidate) -> str:
         """Say which torque is too large or which bodies touch at finer steps; "" if none do."""
@@ -248,10 +262,10 @@ class Design:
         problem: Problem,
         *,
         seed: int = 0,
-        effort: int = 600,
+        effort: int = EFFORT,
         progress: Callable[[str], object] = lambda _: None,
     ) -> Self:
-        """Design motions of each family, and compare them.
+        """Draw motions of each family, improve the best, and compare them.
 
         Parameters
         ----------
@@ -259,15 +273,17 @@ class Design:
         seed : int
             Seed of the draws.
         effort : int
-            Motions that are tried for the best searched family; for the others a quarter.
+            Splines that are tried, from the best motion of the other families.
         progress : callable, optional
             Is given a line for each family.
         """
         seed = whole("seed", seed, 0, 2**63)
-        effort = whole("effort", effort, BEGUN, 10**7)
+        effort = whole("effort", effort, 1, 10**7)
         rng = np.random.default_rng(seed)
-        drawn = list(map(problem.checked, _candidates(problem, rng, effort, progress)))
-        found = sorted(drawn, key=lambda one: (not one.free, one.score))
+        drawn = list(map(problem.checked, _drawn(problem, rng, progress)))
+        begun = min(drawn, key=_order)
+        last = problem.checked(improved(problem, begun, effort, progress))
+        found = sorted([*drawn, last], key=_order)
         if not found[0].free:
             raise SpecificationError(
                 f"no motion was found within the limits of torque and without collisions (in the "
@@ -284,29 +300,25 @@ class Design:
         return cls(problem, tuple(shared), problem.reference, gap / identified)
 
 
-def _candidates(
-    problem: Problem, rng: np.random.Generator, effort: int, progress: Callable[[str], object]
+def _order(one: Candidate) -> tuple[bool, float]:
+    return not one.free, one.score
+
+
+def _drawn(
+    problem: Problem, rng: np.random.Generator, progress: Callable[[str], object]
 ) -> Iterator[Candidate]:
-    """Yield the best motion of each family."""
+    """Yield the best random motion of each family."""
     limits, seconds = problem.limits, problem.seconds
     best = multisine(problem, rng)
     progress(f"multisine, best of {REFERENCES}: {_said(best)}")
     yield best
     periods = [period for period in PERIODS if period < seconds]
-    tried = [
-        [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(BEGUN)]
-        for family in (Fourier(limits, seconds, period) for period in [*periods, seconds])
-    ]
-    tried.sort(key=lambda group: min(one.score for one in group))
-    ladder = Ladder(limits, seconds)
-    planned = receding(problem, ladder, rng, progress)
-    found = [
-        searched(problem, group[0].family, rng, effort // 4, group, progress)
-        for group in (*tried[:2], [dataclasses.replace(planned, name=ladder.name)])
-    ]
-    found.sort(key=lambda one: one.score)
-    yield searched(problem, found[0].family, rng, effort, found[:1], progress)
-    yield from (*found[1:], planned)
+    series = [Fourier(limits, seconds, period) for period in [*periods, seconds]]
+    for family in (*series, Ladder(limits, seconds)):
+        drawn = (problem.candidate(family, rng.standard_normal(family.size)) for _ in range(DRAWN))
+        best = min(drawn, key=lambda one: one.score)
+        progress(f"{family.name}, best of {DRAWN}: {_said(best)}")
+        yield best
 
 
 def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
@@ -326,48 +338,60 @@ def _said(one: Candidate) -> str:
     return f"mean relative error {100.0 * math.exp(np.log(one.errors).mean()):.3g} %"
 
 
-def searched(
+def improved(
     problem: Problem,
-    family: Family,
-    rng: np.random.Generator,
+    begun: Candidate,
     effort: int,
-    begun: Sequence[Candidate] = (),
     progress: Callable[[str], object] = lambda _: None,
 ) -> Candidate:
-    """Return the best motion that a random search finds.
+    """Return the best spline of some, the first of them near a motion.
 
-    From the best of some draws it goes on by changes of a few numbers, and keeps what is better.
+    Each next one maximises the linearised criterion near the best: successive linear programs, R.
+    E. Griffith and R. A. Stewart, Management Science 7, 4 (1961). It is kept where it is better and
+    nothing stands against it.
     """
-    drawn = (problem.candidate(family, rng.standard_normal(family.size)) for _ in range(BEGUN))
-    best = min(begun or drawn, key=lambda one: one.score)
-    for _ in range(effort - BEGUN):
-        numbers = best.numbers.reshape(-1, family.n)
-        changed = rng.random(numbers.shape) < rng.choice(CHANGED)
-        fresh = KEPT * numbers + math.sqrt(1.0 - KEPT**2) * rng.standard_normal(numbers.shape)
-        one = problem.candidate(family, np.where(changed, fresh, numbers).ravel())
-        best = min(best, one, key=lambda each: each.score)
-    progress(f"{family.name}, {effort} motions: {_said(best)}")
+    spline = Spline(problem.limits, problem.seconds)
+    basis = spline.basis(problem.step)
+    best = problem.candidate(spline, spline.nearest(begun.motion(problem.step)))
+    radius, slopes = RADIUS, None
+    for _ in range(effort):
+        if slopes is None:
+            points = spline.shortened(best.numbers, best.reach)
+            parts = zip(basis, gradient(problem, best.motion(problem.step)), strict=True)
+            slopes = np.sum([of.T @ by for of, by in parts], axis=0)
+        one = problem.candidate(spline, spline.ascent(points, slopes, radius))
+        if one.score < best.score and not problem.obstacle(one):
+            best, slopes, radius = one, None, min(1.5 * radius, WIDEST)
+        elif (radius := 0.4 * radius) < NARROWEST:
+            break
+    progress(f"{spline.name}, from {begun.name}: {_said(best)}")
     return best
 
 
-def receding(
-    problem: Problem,
-    ladder: Ladder,
-    rng: np.random.Generator,
-    progress: Callable[[str], object] = lambda _: None,
-    tries: int = 12,
-) -> Candidate:
-    """Return a ladder whose segments are chosen one after another, each the best of some draws."""
-    numbers = rng.standard_normal((ladder.segments + 1, ladder.n))
-    best = problem.candidate(ladder, numbers.ravel())
-    for segment in range(1, ladder.segments + 1):
-        for _ in range(tries):
-            numbers = best.numbers.reshape(ladder.segments + 1, ladder.n).copy()
-            numbers[segment] = rng.standard_normal(ladder.n)
-            one = problem.candidate(ladder, numbers.ravel())
-            best = min(best, one, key=lambda each: each.score)
-    progress(f"receding plans, {ladder.segments} segments: {_said(best)}")
-    return dataclasses.replace(best, name="receding plans")
+def gradient(problem: Problem, motion: Motion) -> list[Array]:
+    """Return by how much positions, velocities and accelerations lower the score, (T, n) each."""
+    unknowns, rate, n = problem.tangent, problem.rate, problem.body.n
+    rows = unknowns.weighted(motion, rate)
+    flat = rows.reshape(-1, len(unknowns))
+    information = flat.T @ flat
+    errors = problem.errors(information)
+    information += np.eye(len(unknowns))
+    weights = 0.5 / problem.count * _by_information(information, problem.count)
+    above = np.log(errors / problem.reference)
+    if above.max() > 0.0:
+        columns = np.linalg.inv(information)[:, : problem.count] / errors
+        shares = np.exp(SHARP * (above - above.max()))
+        weights += 0.5 * FLOOR / shares.sum() * (columns * shares) @ columns.T
+    now, found = _values(rows, weights), []
+    parts = [motion.positions, motion.velocities, motion.accelerations]
+    scales = [np.ones(n), problem.limits.velocity, problem.limits.acceleration]
+    for i, scale in enumerate(scales):
+        moved = [np.tile(part, (n, 1)) for part in parts]
+        step = STEP * np.repeat(np.diag(scale), len(now), axis=0)
+        moved[i] += step
+        values = _values(unknowns.weighted(Motion(motion.dt, *moved), rate), weights)
+        found.append((values.reshape(n, -1) - now).T / (STEP * scale))
+    return found
 
 
 POOL, ROUNDS = 1500, 60
@@ -393,18 +417,23 @@ def attainable(problem: Problem, rng: np.random.Generator) -> tuple[float, float
     flat = rows.reshape(-1, p)
     for _ in range(ROUNDS + 1):
         information = flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
-        slopes = _slopes(information + np.eye(p), rows, s)
+        slopes = _values(rows, _by_information(information + np.eye(p), s))
         mean, gap = float(weights @ slopes), float(slopes.max() - weights @ slopes)
         weights = weights * np.sqrt(np.maximum(slopes, 0.0) / mean)
         weights /= weights.sum()
     return problem.determinant(information) + gap, gap
 
 
-def _slopes(information: Array, rows: Array, s: int) -> Array:
-    """Return the derivative of D_s by the weight of each state, (N,)."""
-    inverse = np.linalg.inv(information)
+def _by_information(information: Array, s: int) -> Array:
+    """Return the derivative of D_s by the information, (p, p)."""
+    inverse = np.array(np.linalg.inv(information), dtype=float)
     inverse[s:, s:] -= np.linalg.inv(information[s:, s:])
-    result: Array = np.einsum("tjp,tjp->t", rows @ inverse, rows)
+    return inverse
+
+
+def _values(rows: Array, weights: Array) -> Array:
+    """Return the weight of what each state tells, (N,), of its rows, (N, n, p)."""
+    result: Array = np.einsum("tjp,tjp->t", rows @ weights, rows)
     return result
 
 

@@ -43,6 +43,9 @@ NEAR = 1.4
 BATCH = 10
 """Windows in a batch, whose means show how far innovations are correlated."""
 
+MISSED = 0.05
+"""Probability that an interval misses."""
+
 SIGN = 0.003
 """Width in which dry friction is taken to change its sign."""
 
@@ -138,8 +141,6 @@ class FrictionLearner:
         square: the intervals are narrowest there.
     seed : int
         Seed of the network's first parameters.
-    level : float
-        Probability that an interval misses, 0.05.
     window : int
         Periods of control in a window.
 
@@ -159,7 +160,6 @@ class FrictionLearner:
         dt: float = 0.002,
         relative: float = 0.05,
         seed: int = 0,
-        level: float = 0.05,
         window: int = WINDOW[0],
     ) -> None:
         if friction not in FRICTION:
@@ -175,7 +175,7 @@ class FrictionLearner:
         self.covariance = np.tile(self._prior, (n, 1, 1))
         self._squares = np.full((2, n), [[10.0 * NOISE**2], [10.0]])
         self._batches, self._pending = np.full((2, n), 10.0), np.zeros((2, n))
-        self.boundary, self.relative = boundary(level), relative
+        self.boundary, self.relative = boundary(MISSED), relative
         self._expected: Array | None = None
         self.windows = np.zeros(n, dtype=int)
 
@@ -211,11 +211,6 @@ class FrictionLearner:
         result: Array = np.sign(value) * np.maximum(size, 0.0) * self.limits.torque
         return result
 
-    def features(self, q: Array) -> Array:
-        """Return the features of ripple at positions (..., n), (..., n, 62)."""
-        angles = q[..., None] * RIPPLE
-        return np.concatenate([np.cos(angles), np.sin(angles)], axis=-1)
-
     def innovations(
         self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
     ) -> tuple[Array, Array, Array]:
@@ -234,7 +229,8 @@ class FrictionLearner:
         parameters = self.mean[:, : self.p]
         mean = self.model.torques(parameters, within) @ weights
         rows = weights @ self.model.jacobian(parameters, within)
-        features = self.features(q)
+        angles = q[:, None] * RIPPLE
+        features = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
         missing = (torque - self._inverse(q, v, a)) / self.limits.torque
         missing = missing - mean - (features * self.mean[:, self.p :]).sum(axis=1)
         rows = np.concatenate([rows, features], axis=1) * moving[:, None]

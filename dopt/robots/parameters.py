@@ -128,6 +128,7 @@ class Unknowns:
                 f"{', '.join([*OF_BODIES, *OF_JOINTS])}."
             )
         self.parameters = tuple(found.values())
+        self._directions = self._inertial_directions()
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -172,6 +173,7 @@ class Unknowns:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         result = copy.copy(self)
         result.body = Body(model, body.source)
+        result._directions = result._inertial_directions()
         return result, gears
 
     def _matching(self, name: str) -> list[Parameter]:
@@ -242,10 +244,11 @@ class Unknowns:
         needs_torques = any(one.kind == "gear" for one in self.parameters)
         if inertial or needs_torques:
             rows = body.regressor(motion) if rigid is None else rigid
-            result[:, :, inertial] = rows @ self._inertial_directions(inertial)
+            result[:, :, inertial] = rows @ self._directions
+        signs = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
-            friction += model.dof_frictionloss[body.dofs] * self._signs(motion)
+            friction += model.dof_frictionloss[body.dofs] * signs
             torques = body.torques(motion, rows) + friction
         for i, one in enumerate(self.parameters):
             if one.kind not in OF_JOINTS:
@@ -254,22 +257,18 @@ class Unknowns:
             if one.kind == "gear":
                 result[:, k, i] = -torques[:, k]
             elif one.kind == "frictionloss":
-                result[:, k, i] = self._signs(motion)[:, k]
+                result[:, k, i] = signs[:, k]
             else:
                 moved = motion.accelerations if one.kind == "armature" else motion.velocities
                 result[:, k, i] = moved[:, k]
         return result * self.scales
 
-    def _signs(self, motion: Motion) -> Array:
-        """Return the signs of the velocities, smooth about 0, (T, n)."""
-        return np.tanh(motion.velocities / (SLOW * self.limits.velocity))
-
-    def _inertial_directions(self, places: list[int]) -> Array:
-        """Return the change of the inertial parameters with each unknown one, (10 · bodies, p)."""
+    def _inertial_directions(self) -> Array:
+        """Return changes of the inertial parameters with those of bodies, (10 · bodies, k)."""
         body, model = self.body, self.body.model
-        result = np.zeros((INERTIAL * len(body.bodies), len(places)))
-        for i, place in enumerate(places):
-            one = self.parameters[place]
+        ours = [one for one in self.parameters if one.kind not in OF_JOINTS]
+        result = np.zeros((INERTIAL * len(body.bodies), len(ours)))
+        for i, one in enumerate(ours):
             which = body.bodies.index(one.place)
             b = body.moved[which]
             mass, c = float(model.body_mass[b]), np.array(model.body_ipos[b])

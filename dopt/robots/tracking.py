@@ -33,6 +33,9 @@ SAME = 1e-8
 BRAKING = np.array([[0.25], [0.5], [0.75], [1.0]])
 """Parts of the time of braking after which contacts are looked for."""
 
+TAKEN = 0.7
+"""Part of the limits of torque that weight and accelerations may take."""
+
 TRIED = 0.05
 """Part of a joint's range that it would move alone, after all have braked before a contact."""
 
@@ -160,10 +163,8 @@ class Guard:
         return below >= least, above >= least
 
 
-def possible_acceleration(
-    known: KnownBody, limits: Limits, share: float = 0.7
-) -> tuple[Array, Array]:
-    """Return accelerations within limits that a share of the torques allows, and inertias: (n,).
+def possible_acceleration(known: KnownBody, limits: Limits) -> tuple[Array, Array]:
+    """Return accelerations within limits that 70 % of the torques allow, and inertias: (n,).
 
     Gravity and the joint's own inertia are looked at in 200 random positions; the largest counts.
     """
@@ -173,11 +174,11 @@ def possible_acceleration(
     for q in low + (high - low) * random.random((200, n)):
         held = np.abs(known.inverse(q, np.zeros(n), np.zeros(n)))
         own = np.diag(known.mass_matrix())
-        least = np.minimum(least, (share * limits.torque - held) / own)
+        least = np.minimum(least, (TAKEN * limits.torque - held) / own)
         largest = np.maximum(largest, own)
     if least.min() <= 0.0:
         raise SpecificationError(
-            f"joint '{known.body.joints[least.argmin()]}' takes more than {100.0 * share:.0f} % of "
+            f"joint '{known.body.joints[least.argmin()]}' takes more than {100.0 * TAKEN:.0f} % of "
             f"its limit of torque at rest, at some positions in the ranges that are given: give "
             f"smaller ranges, or a larger limit of torque."
         )

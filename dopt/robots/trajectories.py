@@ -2,7 +2,7 @@
 
 Motions begin and end at rest. Multisines and Fourier series: J. Swevers et al., "Optimal robot
 excitation and identification", IEEE Trans. Robotics and Automation 13, 5 (1997). Ladders move each
-joint by segments of constant speed.
+joint by segments of constant speed. Splines take any shape, which is improved step by step.
 """
 
 from __future__ import annotations
@@ -12,6 +12,10 @@ import math
 from abc import ABC, abstractmethod
 
 import numpy as np
+from scipy.interpolate import BSpline
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import csr_array, vstack
+from scipy.sparse.linalg import spsolve
 from scipy.special import ndtr
 
 from dopt.robots.body import Motion
@@ -32,6 +36,9 @@ SEGMENT = 0.5
 
 HARMONICS = 10
 """Harmonics of a Fourier series."""
+
+KNOT, LEAST = 0.2, 12
+"""Seconds between two knots of a spline, and its segments at the least."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,6 +212,112 @@ class Ladder(Family):
             columns.append(path.sampled(t))
         q, v, a = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
         return Motion(dt, q, v, a)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spline(Family):
+    """Cubic spline of each joint: numbers are its control points, the first and the last at rest.
+
+    Its positions, velocities and accelerations lie between its control points and their
+    differences, so that limits are linear in the numbers.
+    """
+
+    name = "spline"
+
+    @property
+    def _count(self) -> int:
+        """Control points that are free: three more at either end repeat it."""
+        return max(LEAST, round(self.seconds / KNOT)) - 3
+
+    @property
+    def size(self) -> int:
+        return self.n * self._count
+
+    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
+        points, middle = numbers.reshape(self._count, self.n), self.limits.middle
+        q, v, a = (of @ points for of in self.basis(dt))
+        return Motion(dt, middle + reach * (q - middle), reach * v, reach * a)
+
+    def basis(self, dt: float) -> tuple[csr_array, csr_array, csr_array]:
+        """Return positions, velocities and accelerations by the control points, (T, m) each."""
+        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        knots = self._knot * np.arange(-3.0, self._count + 7.0)
+        first, second = self._rates()
+        return (
+            BSpline.design_matrix(t, knots, 3) @ self._repeated(),
+            BSpline.design_matrix(t, knots[1:-1], 2) @ first,
+            BSpline.design_matrix(t, knots[2:-2], 1) @ second,
+        )
+
+    @property
+    def _knot(self) -> float:
+        return self.seconds / (self._count + 3)
+
+    def _repeated(self) -> csr_array:
+        rows, last = np.arange(self._count + 6), self._count - 1
+        return csr_array((np.ones(len(rows)), (rows, np.clip(rows - 3, 0, last))))
+
+    def _rates(self) -> tuple[csr_array, csr_array]:
+        """Return velocities and accelerations between control points, (m + 5, m), (m + 4, m)."""
+        points = self._repeated()
+        first = (points[1:] - points[:-1]) / self._knot
+        return first, (first[1:] - first[:-1]) / self._knot
+
+    def shortened(self, numbers: Array, reach: float) -> Array:
+        """Return the numbers of a motion that reaches as far as some do with a share of it."""
+        away = numbers.reshape(self._count, self.n) - self.limits.middle
+        result: Array = self.limits.middle + reach * away
+        return result.ravel()
+
+    def nearest(self, motion: Motion) -> Array:
+        """Return the numbers of a motion by least squares; joints shrink into their limits."""
+        basis, *_ = self.basis(motion.dt)
+        points = spsolve((basis.T @ basis).tocsc(), basis.T @ motion.positions)
+        points = points.reshape(-1, self.n)
+        limits, (first, second) = self.limits, self._rates()
+        away = points - limits.middle
+        taken = np.max(
+            [
+                np.abs(away).max(axis=0) / (np.ptp(limits.position, axis=1) / 2.0),
+                np.abs(first @ points).max(axis=0) / limits.velocity,
+                np.abs(second @ points).max(axis=0) / limits.acceleration,
+            ],
+            axis=0,
+        )
+        result: Array = limits.middle + away / np.maximum(taken / ROOM, 1.0)
+        return result.ravel()
+
+    def ascent(self, numbers: Array, slopes: Array, radius: float) -> Array:
+        """Return the numbers within the limits that maximise a linear function.
+
+        Parameters
+        ----------
+        numbers : (size,)
+            Where it is linear.
+        slopes : (m, n)
+            Its derivatives by the control points.
+        radius : float
+            Share of its range of position by which a control point may change.
+        """
+        points, limits = numbers.reshape(self._count, self.n), self.limits
+        found = points.copy()
+        first, second = self._rates()
+        rates, counts = vstack([first, second]), [first.shape[0], second.shape[0]]
+        for k, (low, high) in enumerate(limits.position):
+            half, most = ROOM * (high - low) / 2.0, radius * (high - low)
+            sizes = ROOM * np.array([limits.velocity[k], limits.acceleration[k]])
+            largest = np.repeat(sizes, counts)
+            program = milp(
+                -slopes[:, k],
+                bounds=Bounds(
+                    np.maximum(limits.middle[k] - half, points[:, k] - most),
+                    np.minimum(limits.middle[k] + half, points[:, k] + most),
+                ),
+                constraints=LinearConstraint(rates, -largest, largest),
+            )
+            if program.x is not None:  # rounding alone lets none be found
+                found[:, k] = program.x
+        return found.ravel()
 
 
 class JointPath:

@@ -68,8 +68,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--effort",
         type=positive("--effort", int),
-        default=600,
-        help="motions that are tried for the best family; a quarter for the others (600)",
+        default=40,
+        help="motions that are tried to improve the best random one (40)",
     )
     parser.add_argument(
         "--out",

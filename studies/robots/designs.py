@@ -2,8 +2,8 @@
 
 ``python -m studies.robots.designs --urdf MODEL --seeds 20`` appends a row for each
 arm and seed to ``docs/robots_designs.csv``. The seed draws the multisines, the search, and a robot
-whose parameters differ from the file's by 10 % of each one's size; torques are measured with white
-noise.
+whose parameters differ from the file's: logarithms of positive ones have a standard deviation of
+.1, centres a tenth of their sizes. Torques are measured with white noise.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from dopt.robots.body import Body, KnownBody, Motion
-from dopt.robots.design import COARSE, Design, Problem
+from dopt.robots.design import COARSE, EFFORT, Design, Problem
 from dopt.robots.limits import Limits
-from dopt.robots.parameters import SLOW, Identifiability, relative_errors
+from dopt.robots.parameters import SLOW, Identifiability, Unknowns
 from dopt.robots.tracking import Tracker, possible_acceleration
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, LIMITS, Friction, SimulatedRobot, iiwa, jaco
@@ -30,10 +30,16 @@ FILE = Path("docs/robots_designs.csv")
 UNKNOWN = "mass,com,inertia,armature,damping,frictionloss,gear"
 
 OFF = 0.1
-"""Standard deviation of a true parameter about the file's, by its size."""
+"""Standard deviation of a true parameter about the file's, of its logarithm or by its size."""
 
 WINDOW = 31
 """Samples of a local cubic: 62 ms."""
+
+FAR = 1.5
+"""Errors by expected ones that count as too large."""
+
+TURNING = 3.0
+"""Multiple of the width of dry friction's sign below which rates tell too little of the sign."""
 
 KNOWN = 0.3
 """Share of the prior standard deviation below which an expected error is compared with a fit's."""
@@ -86,11 +92,25 @@ def held(motion: Motion) -> Motion:
     return Motion(CONTROL, positions, velocities, (np.diff(v, axis=0) / CONTROL)[inner])
 
 
-def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
-    """Return the relative changes of the parameters by three steps of Gauss and Newton, (p,).
+def values_of(unknowns: Unknowns, changes: Array) -> tuple[Array, Array]:
+    """Return values of parameters and their derivatives by changes from the file's, (p,) each.
 
-    Their prior standard deviation is :data:`OFF`. With a wider one, what the motion says little of
-    goes to impossible values, masses below 0, and the steps do not converge.
+    Changes are logarithms of positive parameters, which stay positive, and shares of the sizes of
+    the others. Derivatives are in units of the sizes.
+    """
+    values, slopes = unknowns.values, np.exp(changes)
+    centres = np.array([one.kind.startswith("com") for one in unknowns.parameters])
+    shifted = centres | (values == 0.0)
+    moved = np.where(shifted, values + changes * unknowns.scales, values * slopes)
+    return moved, np.where(shifted, 1.0, slopes)
+
+
+def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
+    """Return the changes of the parameters by three steps of Gauss and Newton, (p,).
+
+    Their prior standard deviation is :data:`OFF`: a motion says little of some. In logarithms it is
+    a relative one at all values; about the values themselves, it draws what multiplies many
+    parameters, such as gears, towards 0.
 
     Regressors at the reference, which has no noise, are the instruments: A. Janot, P.-O. Vandanjon,
     M. Gautier, "A generic instrumental variable approach for industrial robot identification", IEEE
@@ -103,20 +123,30 @@ def fitted(problem: Problem, rows: Array, reference: Motion) -> Array:
     prior = np.eye(len(found)) / OFF**2
     slow = SLOW * problem.limits.velocity
     noise = first.noise * problem.limits.torque / np.sqrt(problem.rate * CONTROL)
+    moving = np.abs(planned.velocities) > TURNING * slow
     for _ in range(3):
-        values = first.values + found * first.scales
+        values, slopes = values_of(first, found)
         unknowns, gears = first.at(values)
         body = unknowns.body
         damping, dry = body.model.dof_damping[body.dofs], body.model.dof_frictionloss[body.dofs]
         v = motion.velocities
         expected = body.torques(motion) + damping * v + dry * np.tanh(v / slow)
-        scale = 1.0 / (gears * noise)[:, None]
+        scale = (moving / (gears * noise))[:, :, None]
         x, z = (
-            (unknowns.regressor(one) * scale).reshape(-1, len(found)) for one in (motion, planned)
+            (unknowns.regressor(one) * scale).reshape(-1, len(found)) * slopes
+            for one in (motion, planned)
         )
-        left = ((commands - expected / gears) / noise).reshape(-1)
+        left = (moving * (commands - expected / gears) / noise).reshape(-1)
         found = found + np.linalg.solve(z.T @ x + prior, z.T @ left - prior @ found)
     return found
+
+
+def chance(covariance: Array) -> float:
+    """Return how often the root mean square of errors by expected ones exceeds :data:`FAR`."""
+    sizes = np.sqrt(np.diag(covariance))
+    spread = np.linalg.eigvalsh(covariance / np.outer(sizes, sizes)) / len(sizes)
+    squares = np.random.default_rng(0).standard_normal((10000, len(sizes))) ** 2 @ spread
+    return float((squares > FAR**2).mean())
 
 
 def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[str, object]:
@@ -133,8 +163,7 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
     off = OFF * rng.standard_normal(problem.count)
     centres = np.array([one.kind.startswith("com") for one in problem.requested])
     off = np.where((problem.unknowns.values == 0.0) & ~centres, np.abs(off), off)
-    values = problem.unknowns.values + off * problem.unknowns.scales
-    unknowns, gears = problem.unknowns.at(values)
+    unknowns, gears = problem.unknowns.at(values_of(problem.unknowns, off)[0])
     true, model = unknowns.body, unknowns.body.model
     friction = Friction(
         coulomb=np.abs(model.dof_frictionloss[true.dofs]),
@@ -148,8 +177,11 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
     rows = measured(robot, body, gears, motion)
     rows[:, 1] += problem.unknowns.noise * limits.torque * rng.standard_normal(rows[:, 1].shape)
     # Errors that are expected with the prior of the fit, as shares of its standard deviation.
-    shares = relative_errors(OFF**2 * problem.information(best.motion(COARSE)))
-    z = ((fitted(problem, rows, motion) - off) / (OFF * shares))[shares < KNOWN]
+    information = OFF**2 * problem.information(best.motion(COARSE))
+    covariance = np.array(np.linalg.inv(information + np.eye(len(off))), dtype=float)
+    shares = np.sqrt(np.diag(covariance))
+    told = shares < KNOWN
+    z = ((fitted(problem, rows, motion) - off) / (OFF * shares))[told]
     return {
         "arm": arm,
         "seed": seed,
@@ -164,6 +196,7 @@ def row(arm: str, body: Body, limits: Limits, seed: int, effort: int) -> dict[st
         "fitted": len(z),
         "achieved": float(np.sqrt((z**2).mean())),
         "achieved_worst": float(np.abs(z).max()),
+        "chance": chance(covariance[np.ix_(told, told)]),
         "cpu_seconds": spent,
     }
 
@@ -174,7 +207,7 @@ def main() -> None:
     parser.add_argument("--urdf", type=Path, help="URDF of the iiwa")
     parser.add_argument("--limits", type=Path, default=LIMITS, help="its limits")
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--effort", type=int, default=600)
+    parser.add_argument("--effort", type=int, default=EFFORT)
     given = parser.parse_args()
     arms = {"jaco": jaco()} | ({"iiwa": iiwa(given.urdf, given.limits)} if given.urdf else {})
     done = set()
@@ -190,7 +223,7 @@ def main() -> None:
                 limits = Limits(limits.position, limits.velocity, possible, limits.torque)
             one = row(arm, body, limits, seed, given.effort)
             with FILE.open("a", newline="") as file:
-                writer = csv.DictWriter(file, one)
+                writer = csv.DictWriter(file, one, lineterminator="\n")
                 if not file.tell():
                     writer.writeheader()
                 writer.writerow(

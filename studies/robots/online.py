@@ -20,13 +20,12 @@ import numpy as np
 import pandas as pd
 
 from dopt.robots.body import Body, KnownBody, Motion
-from dopt.robots.design import Problem, searched
-from dopt.robots.design import multisine as multisine_of
+from dopt.robots.design import DRAWN, REFERENCES, Design, Problem
 from dopt.robots.explorer import RobotExplorer
 from dopt.robots.friction import SPEEDS, FrictionLearner
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Tracker, possible_acceleration
-from dopt.robots.trajectories import Fourier, Ladder, Multisine
+from dopt.robots.trajectories import Multisine
 from dopt.robots.windows import window_size
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, LIMITS, SimulatedRobot, iiwa, jaco
@@ -35,9 +34,6 @@ FILE = Path("docs/robots_online.csv")
 
 LOOK = 50
 """Periods of control from one comparison with the truth to the next."""
-
-EFFORT = 100
-"""Motions that the search of each family tries."""
 
 CLOSE = 0.05
 """Root mean square error of a friction curve relative to its own, that counts as learned."""
@@ -215,17 +211,12 @@ def times(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:
 
 
 def _designs(body: Body, limits: Limits, seconds: float) -> Iterator[tuple[str, Motion]]:
-    """Yield the motions designed for friction before the run, each the best of many."""
+    """Yield motions for friction that are chosen before the run."""
     problem = Problem(body, limits, "damping,frictionloss", seconds, nuisance="")
-    random = np.random.default_rng(0)
-    yield "multisine, best of 25", multisine_of(problem, random).motion(CONTROL)
-    for family in [Fourier(limits, seconds, period) for period in (2.0, 5.0, 10.0)]:
-        yield family.name, searched(problem, family, random, EFFORT).motion(CONTROL)
-    ladder = Ladder(limits, seconds)
-    plain = random.standard_normal((10, ladder.size))
-    best = min((problem.candidate(ladder, x) for x in plain), key=lambda one: one.score)
-    yield "ladder, best of 10", best.motion(CONTROL)
-    yield "D-optimal ladder", searched(problem, ladder, random, EFFORT).motion(CONTROL)
+    found = {one.name: one.motion(CONTROL) for one in Design.of(problem).candidates}
+    yield f"multisine, best of {REFERENCES}", found["multisine"]
+    yield f"ladder, best of {DRAWN}", found["ladder"]
+    yield "D-optimal design", found["spline"]
 
 
 def _settled(name: str, label: str, seed: int, trace: Trace) -> Iterator[Row]:
@@ -315,7 +306,7 @@ def main() -> None:
         arms["iiwa"] = iiwa(given.urdf, given.limits)
     fresh = not given.out.exists()
     with given.out.open("a", newline="") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         if fresh:
             writer.writerow([field.name for field in dataclasses.fields(Row)])
         for name, (body, limits) in arms.items():

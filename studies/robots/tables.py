@@ -9,6 +9,7 @@ import pandas as pd
 
 from analysis.style import number
 from studies.conclusions.tables import markdown
+from studies.robots.designs import FAR
 
 DOCS = Path(__file__).parents[2] / "docs"
 ARMS = ("iiwa", "jaco")
@@ -92,10 +93,11 @@ def robots_designs() -> str:
                 f"{100.0 * rows.share.median():.0f} %",
                 f"{rows.achieved.median():.2f} [{rows.achieved.min():.2f}, "
                 f"{rows.achieved.max():.2f}]",
+                f"{(rows.achieved > FAR).sum()} ({rows.chance.sum():.1f})",
             ]
         )
-    head = ["arm", "unknowns", "errors by multisines", "worst", "information", "fit by expected"]
-    return markdown(head, body)
+    head = ["arm", "unknowns", "errors by multisines", "worst", "information"]
+    return markdown([*head, "fit by expected", f"above {FAR:g} (by chance)"], body)
 
 
 TABLES = (robots_times, robots_coverage, robots_designs)

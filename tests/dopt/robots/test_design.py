@@ -12,10 +12,10 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
-from dopt.robots.design import LEAST, Design, Problem, attainable, multisine
+from dopt.robots.design import LEAST, Design, Problem, attainable, gradient, multisine
 from dopt.robots.limits import Limits
 from dopt.robots.parameters import relative_errors
-from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine
+from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine, Spline
 from tests.dopt.robots.test_body import FOLD, arm, body_of, jaco, limits, limits_of
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo")
@@ -38,8 +38,13 @@ def test_motions_keep_limits_begin_and_end_at_rest_and_are_integrals(
     limits: Limits, seed: int, seconds: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    for family in families(limits, seconds):
-        motion = family.motion(2.0 * rng.standard_normal(family.size), 0.002)
+    tried = [(one, 2.0 * rng.standard_normal(one.size)) for one in families(limits, seconds)]
+    spline, (drawn, numbers) = Spline(limits, seconds), tried[seed % len(tried)]
+    points = spline.nearest(drawn.motion(numbers, 0.04))
+    for radius in (0.1, 0.3):
+        points = spline.ascent(points, rng.standard_normal((points.size // 4, 4)), radius)
+    for family, numbers in (*tried, (spline, points)):
+        motion = family.motion(numbers, 0.002)
         shares = limits.shares(motion)
         assert max(shares.values()) <= ROOM + 1e-9, (family.name, shares)
         assert np.abs(motion.velocities[[0, -1]]).max() < 1e-9, family.name
@@ -63,7 +68,7 @@ def test_a_ladder_holds_constant_speeds(limits: Limits) -> None:
 
 def test_a_design_beats_multisines_and_no_motion_beats_the_bound(arm: Body, limits: Limits) -> None:
     problem = Problem(arm, limits, "damping,frictionloss", 6.0)
-    design = Design.of(problem, effort=60)
+    design = Design.of(problem, effort=8)
     reference = multisine(problem, np.random.default_rng(5))
     assert design.best.score < reference.score
     assert all(0.0 < one.share <= 1.0 for one in design.candidates)
@@ -137,7 +142,7 @@ def test_a_touch_between_the_rows_of_the_search_is_found_at_the_end(tmp_path: Pa
     one = problem.candidate(Dip(limits, 3.0), np.zeros(1))
     assert one.free
     assert not problem.checked(one).free
-    design = Design.of(problem, effort=40)
+    design = Design.of(problem, effort=8)
     assert not body.collisions(design.best.motion(0.005).positions)
     touched = [body.collisions(each.motion(0.01).positions) for each in design.candidates]
     assert [each.free for each in design.candidates] == [not found for found in touched]
@@ -179,18 +184,38 @@ def test_a_centre_on_the_axis_in_the_file_has_the_error_of_the_mass(tmp_path: Pa
     assert error == pytest.approx(LEAST / np.sqrt(1.0 + LEAST**2), rel=0.02)
 
 
-def test_the_best_searched_family_has_the_whole_effort(arm: Body, limits: Limits) -> None:
+def test_the_best_random_motion_is_improved_the_more_the_longer(arm: Body, limits: Limits) -> None:
     lines: list[str] = []
     problem = Problem(arm, limits, "damping", 3.0)
-    first, again, other = (
-        Design.of(problem, seed=seed, effort=40, progress=progress)
-        for seed, progress in ((1, lines.append), (1, str), (2, str))
+    first, again, longer, other = (
+        Design.of(problem, seed=seed, effort=effort, progress=progress)
+        for seed, effort, progress in ((1, 3, lines.append), (1, 3, str), (1, 20, str), (2, 3, str))
     )
-    searches = [line.split(" motions")[0] for line in lines if "motions" in line]
-    assert sorted(line.split(", ")[-1] for line in searches) == ["10", "10", "10", "40"]
-    assert searches[-1] == f"{first.best.name}, 40"
+    assert first.best.name == "spline"
+    assert lines[-1].startswith(f"spline, from {first.candidates[1].name}: mean relative error")
     np.testing.assert_array_equal(first.best.numbers, again.best.numbers)
-    assert first.best.score != other.best.score
+    assert longer.best.score < first.best.score != other.best.score
+
+
+@pytest.mark.parametrize("worse", [False, True])
+def test_slopes_of_splines_are_limits_of_differences(
+    arm: Body, limits: Limits, worse: bool
+) -> None:
+    """Also of the penalty, where one error is far above its reference."""
+    problem = Problem(arm, limits, "mass,damping,gear", 4.0)
+    rng, spline, family = np.random.default_rng(0), Spline(limits, 4.0), Fourier(limits, 4.0, 4.0)
+    motion = family.motion(rng.standard_normal(family.size), problem.step)
+    points = spline.nearest(motion)
+    if worse:
+        problem.reference[4] = 0.2 * problem.candidate(spline, points).errors[4]
+    parts = zip(
+        spline.basis(problem.step), gradient(problem, spline.motion(points, 0.04)), strict=True
+    )
+    slopes = np.sum([of.T @ by for of, by in parts], axis=0).ravel()
+    for _ in range(5):
+        step = 1e-5 * rng.standard_normal(len(points))
+        after, before = (problem.candidate(spline, points + way * step) for way in (1.0, -1.0))
+        assert before.score - after.score == pytest.approx(2.0 * slopes @ step, rel=0.02)
 
 
 @pytest.mark.parametrize("name", ["seconds", "noise", "rate"])
@@ -254,19 +279,20 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
 
 
 def test_what_stands_against_every_motion_is_named(tmp_path: Path) -> None:
-    """A slide holds its weight at rest, and not while it moves against friction; and a wall."""
-    body = body_of(
-        """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" range="0 1"
+    """A slide that its torque cannot move against friction, up or, in a second one, at all."""
+    text = """<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" range="0 1"
         frictionloss="20"/><geom size="0.1" mass="6"/></body></worldbody></mujoco>"""
-    )
-    limits = limits_of(body, tmp_path, "joints: {z: {velocity: 1, torque: 70}}")
-    problem = Problem(body, limits, "damping", 3.0, nuisance="")
+    body, level = body_of(text), body_of(text.replace("<world", '<option gravity="0 0 0"/><world'))
+    limits = limits_of(body, tmp_path, "joints: {z: {velocity: 1, torque: 15}}")
     with pytest.raises(
-        SpecificationError, match=r"in the best one, joint 'z' takes [0-9.]+ of 70 N\)"
+        SpecificationError, match=r"in the best one, joint 'z' takes [0-9.]+ of 15 N\)"
     ):
-        Design.of(problem, effort=24)
-    near = dataclasses.replace(limits, torque=np.array([94.0]))  # once refused, for no reason
-    assert Design.of(Problem(body, near, "damping", 3.0, nuisance=""), effort=24).best.free
+        Design.of(Problem(level, limits, "damping", 3.0, nuisance=""), effort=4)
+    for torque in (70.0, 94.0):  # downwards; both ways, which was once refused for no reason
+        near = dataclasses.replace(limits, torque=np.array([torque]))
+        best = Design.of(Problem(body, near, "damping", 3.0, nuisance=""), effort=10).best
+        assert best.free
+        assert (best.motion(0.01).velocities.max() < 0.01) == (torque == 70.0)
     fold = body_of(FOLD)
     given = "joints: {hinge: {position: [1.0, 1.5], velocity: 1, torque: 70}}"
     problem = Problem(fold, limits_of(fold, tmp_path, given), "damping", 3.0)

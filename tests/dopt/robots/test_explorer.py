@@ -141,6 +141,31 @@ def test_joints_that_are_light_for_their_friction_keep_their_limits(seed: int) -
     check_shares(explore(robot, explorer, 1.5), velocity=1.0)
 
 
+ONE = """<mujoco><worldbody><body pos="0 0 1"><joint name="one" {joint}/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size="0.02" mass="1"/>
+  <geom size=".05" pos="0 0 -.4" mass="{load}"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "joint",
+    [
+        'axis="0 1 0" range="-150 150"',
+        'type="slide" axis="0 0 1" range="-.5 .5"',
+        'type="slide" axis="1 0 0" range="-.5 .5"',
+    ],
+)
+def test_single_joints_without_armature_keep_their_limits(joint: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    body = body_of(ONE.format(joint=joint, load=random.uniform(0.1, 2.0)))
+    torque, rate = random.uniform(50.0, 150.0), random.uniform(0.5, 3.0)
+    limits = Limits(body.ranges, *np.array([[rate], [4.0 * rate], [torque]]))
+    dry, viscous = random.uniform(0.03, 0.3) * torque, random.uniform(0.01, 0.1) * torque / rate
+    friction = Friction(*np.array([[dry], [viscous], [0.3 * dry], [0.03 * rate], [0.002 * rate]]))
+    robot = SimulatedRobot(body, limits, seed, friction)
+    check_shares(explore(robot, RobotExplorer(body, limits, seed=seed), 1.5), velocity=1.0)
+
+
 def test_joints_without_armature_are_named() -> None:
     body, limits = loose()
     explorer = RobotExplorer(
