@@ -214,9 +214,10 @@ def _designs(body: Body, limits: Limits, seconds: float) -> Iterator[tuple[str, 
     """Yield motions for friction that are chosen before the run."""
     problem = Problem(body, limits, "damping,frictionloss", seconds, nuisance="")
     found = {one.name: one.motion(CONTROL) for one in Design.of(problem).candidates}
-    yield f"multisine, best of {REFERENCES}", found["multisine"]
-    yield f"ladder, best of {DRAWN}", found["ladder"]
-    yield "D-optimal design", found["spline"]
+    yield f"multisine, best of {REFERENCES}", found.pop("multisine")
+    yield "D-optimal design", found.pop("spline")
+    for name, motion in found.items():
+        yield f"{name}, best of {DRAWN}", motion
 
 
 def _settled(name: str, label: str, seed: int, trace: Trace) -> Iterator[Row]:
