@@ -72,7 +72,7 @@ def plots() -> dict[str, Plot[Any]]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What happened to one output: drawn, unchanged, or nothing stored for it."""
+    """Result of one output: drawn, unchanged, or nothing stored for it."""
 
     name: str
     state: str

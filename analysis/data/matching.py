@@ -62,7 +62,7 @@ _LAST = (
 
 @dataclass(frozen=True)
 class Filter:
-    """What a user asked for; empty means everything.
+    """Selection by a user; an empty one is everything.
 
     ``where`` maps a dotted path of the configuration, such as ``model.width``, to a value; it says
     nothing of a configuration that has no such path, such as the linear model of the oracle.

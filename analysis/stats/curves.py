@@ -246,7 +246,7 @@ def geometric_mean(values: Array) -> Estimate:
 
 
 class Axis(StrEnum):
-    """What the horizontal axis counts."""
+    """Quantity of the horizontal axis."""
 
     STEPS = "steps"
     SECONDS = "seconds"

@@ -66,7 +66,7 @@ LEAST = 0.1
 
 
 class State(NamedTuple):
-    """What is known of a plant: the parameters at which information is computed."""
+    """Knowledge of a plant: the parameters at which information is computed."""
 
     model: Model
     p: Array  # (q,)

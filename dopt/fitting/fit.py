@@ -193,7 +193,7 @@ def fit(
 
 
 class _Selection:
-    """What validation over blocks has chosen so far."""
+    """Choices by validation over blocks so far."""
 
     def __init__(
         self,

@@ -61,7 +61,7 @@ class Estimate(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """What validation over blocks has compared: losses with standard errors, and notes; and how."""
+    """Comparisons by validation over blocks: losses with standard errors, settings and notes."""
 
     table: tuple[tuple[str, float, float], ...]
     window: float  # length that was chosen [s]

@@ -77,7 +77,7 @@ DEPENDENT = 1e-9
 
 
 class Structure(NamedTuple):
-    """What is simulated, apart from the values of its parameters."""
+    """Equations that are simulated, apart from the values of their parameters."""
 
     known: CompiledFunction  # (x, v, c, f)
     derivatives: CompiledFunction  # (x, v, c, f, G), with G of Work

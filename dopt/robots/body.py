@@ -141,7 +141,7 @@ class Body:
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
-        """What the model holds and the torques, or searches for collisions, leave out."""
+        """Parts of the model that torques, or searches for collisions, leave out."""
         lost = f"left out: meshes and their contacts, for one is not there: {listed(self._lost)}"
         left = _left_out(self.model, self._ids)
         return (*[lost][: len(self._lost)], *left, *self._contacts.left_out())

@@ -114,7 +114,7 @@ class Candidate:
 
 
 class Problem:
-    """What a trajectory is to identify, and under which limits.
+    """Parameters that a trajectory is to identify, and its limits.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ class Problem:
         return Candidate(family, numbers, reach, *found, self.score(*found))
 
     def obstacle(self, one: Candidate) -> str:
-        """Say which torque is too large or which bodies touch at finer steps; "" if none do."""
+        """Return which torque is too large or which bodies touch at finer steps; "" if none do."""
         motion, body = one.motion(min(FINE, self.step)), self.body
         strains = self.strains(motion)
         if strains.max() > 1.0:

@@ -342,7 +342,7 @@ class RobotExplorer:
         self._fastest = self.limits.velocity * np.maximum(1.0 - AHEAD * self._ahead, CREEP)
 
     def _rest(self) -> None:
-        """Let all joints brake, and plan one after another when the last one is at rest."""
+        """Brake all joints; the next motion is planned when the last one is at rest."""
         self.counts["near"] += 1
         stop = np.abs(self._v) / self.acceleration
         self._target[:], self._wary[:] = 0.0, True

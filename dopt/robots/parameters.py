@@ -306,7 +306,7 @@ class Unknowns:
 
 @dataclasses.dataclass(frozen=True)
 class Identifiability:
-    """What a motion says of the parameters.
+    """Expected errors of the parameters by a motion, and combinations without effect.
 
     Attributes
     ----------
