@@ -37,12 +37,15 @@ class Combination:
         Sections of the resolved configuration.
     seeds
         Seeds of the configuration, or None for the one in ``settings``.
+    overrides
+        Swept overrides of this combination, as they would be typed.
     used, unused
         Keys set by the grid that exist in this choice of groups, and keys that do not.
     """
 
     settings: Mapping[str, Any]
     seeds: Sequence[Any] | None = None
+    overrides: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
 

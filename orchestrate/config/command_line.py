@@ -28,6 +28,7 @@ from orchestrate.config import TRIAL_SECTIONS, Combination
 from orchestrate.config.expand import expand, reject_unknown
 from orchestrate.config.options import (
     CONFIGURATION,
+    content_of,
     option_names,
     parsed_overrides,
     register,
@@ -262,7 +263,7 @@ def _single(config: DictConfig, overrides: tuple[str, ...]) -> Request:
 def _require_multirun(overrides: Sequence[str], settings: Any) -> None:
     """Refuse an experiment whose sweeps would be ignored without ``-m``."""
     named = {word.lstrip("+").partition("=")[0] for word in overrides}
-    usual = OmegaConf.load(CONFIGURATION / "config.yaml").hydra.sweeper.params
+    usual = content_of(CONFIGURATION / "config.yaml")["hydra"]["sweeper"]["params"]
     sweeps = dict(settings.sweeper.params)
     for grid in settings.sweeper.grids:
         sweeps |= grid

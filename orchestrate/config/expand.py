@@ -1,7 +1,7 @@
 """Expansion of overrides to the combinations of a grid.
 
-:func:`hydra.compose` composes the configuration of each choice of groups, in which the other values
-are set. The result equals what Hydra's basic sweeper gives wherever that one
+:func:`hydra.compose` composes the configuration of each choice of groups; scalar sweeps are a
+product over its plain values. The result equals what Hydra's basic sweeper gives wherever that one
 succeeds, except for the values of some sweeps (:mod:`orchestrate.config.options`).
 
 The basic sweeper fails if an override sets a key that only some of the choices have, such as
@@ -16,7 +16,7 @@ import dataclasses
 import itertools
 import pickle
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import hydra
@@ -24,7 +24,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import ConfigCompositionException
-from omegaconf import Container, DictConfig, ListConfig, OmegaConf, flag_override
+from omegaconf import AnyNode, Container, DictConfig, ListConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
 from dopt.errors import unknown_name
@@ -32,18 +32,17 @@ from dopt.registry import TARGET
 from orchestrate.config import TRIAL_SECTIONS, Combination
 from orchestrate.config.options import (
     KNOWN,
-    NOT_SWEPT,
     Axis,
+    parsed_overrides,
     read_axes,
     unknown_field,
     unknown_setting,
 )
 
+Settings = dict[str, Any]
 Check = Callable[[DictConfig], None]
-Pick = tuple[Axis, int]
-"""Override, and which of its values."""
 
-_REFERENCE = re.compile(r"\$\{\s*\.*[A-Za-z_]\w*(?:\.\w+)*\s*\}")
+_REFERENCE = re.compile(r"\$\{\s*([A-Za-z_]\w*(?:\.\w+)*)\s*\}")
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env:[^${}]*\}")
 
 
@@ -96,11 +95,11 @@ def expand(
     """
     expansion = _Expansion(_Composer(settings), sections, check)
     result: list[Combination] = []
-    for words in grids:
-        axes = read_axes(expansion.composer.loader, words)
-        counts = [1 if axis.key == "seed" else len(axis.texts) for axis in axes]
-        for picks in itertools.product(*map(range, counts)):
-            result.extend(expansion.combinations([*zip(axes, picks, strict=True)]))
+    for arguments in grids:
+        axes = read_axes(expansion.composer.loader, arguments)
+        fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
+        for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
+            result.extend(expansion.combinations(axes, _arguments(fixed, picks)))
     expansion.check_all_used()
     return result
 
@@ -112,47 +111,39 @@ class _Expansion:
     Attributes
     ----------
     used, lacking
-        Keys that some choice uses, and the choices that lack a key that is set, each with its
-        configuration.
+        Keys that some choice uses, and choices, composed without it, that lack a key that is set.
     """
 
     composer: _Composer
     sections: Sequence[str]
     check: Check
     used: set[str] = dataclasses.field(default_factory=set)
-    lacking: dict[str, dict[str, DictConfig]] = dataclasses.field(default_factory=dict)
+    lacking: dict[str, list[DictConfig]] = dataclasses.field(default_factory=dict)
 
-    def combinations(self, picks: Sequence[Pick]) -> Iterator[Combination]:
-        """Yield one combination, with all seeds, or one for each seed if something follows it."""
-        config, lacking = self._compose(picks)
-        self.check(config)
-        used = tuple(axis.key for axis, _ in picks if axis.replaces and axis not in lacking)
+    def combinations(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> Iterator[Combination]:
+        """Yield the combinations of one choice of all overrides except swept scalars."""
+        first, lacking = self._compose(axes, fixed)
+        self.check(first)
+        unused = tuple(axis.key for axis in lacking)
+        kept = [axis for axis in axes if axis not in lacking]
+        used = tuple(axis.key for axis in kept if axis.replaces)
         self.used.update(used)
-        choices = " ".join(_words(_choices(picks)))
-        for axis in lacking:
-            self.lacking.setdefault(axis.key, {})[choices] = config
-        if any(pick for axis, pick in picks if axis in lacking):
-            return  # the same as with the first value of what is lacking
-        swept = (axis for axis, _ in picks if axis.key == "seed" and len(axis.texts) > 1)
-        seeds = next((axis.values for axis in swept), ())
-        together = all(isinstance(seed, int) for seed in seeds) and _is_alone(config, "seed")
-        present = [key for key in self.sections if key in config.keys()]  # noqa: SIM118
-        for number in range(1 if together else len(seeds) or 1):
-            if seeds:
-                OmegaConf.update(config, "seed", seeds[number])
-            yield Combination(
-                settings={key: _resolved(config, key) for key in present},
-                seeds=seeds if seeds and together else None,
-                used=used,
-                unused=tuple(axis.key for axis in lacking),
-            )
+        for key in unused:
+            self.lacking.setdefault(key, []).append(first)
+        scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
+        overrides = tuple(fixed[axis.place] for axis in kept if axis.swept and axis.place in fixed)
+        overlay = _ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
+        if overlay.applicable:
+            found = _overlaid(overlay, scalars, overrides)
+        else:
+            found = self._one_by_one(kept, fixed, scalars)
+        yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
 
     def check_all_used(self) -> None:
         """Refuse a key that no choice has, with the nearest name in its place."""
-        for key, choices in self.lacking.items():
+        for key, configs in self.lacking.items():
             if key in self.used:
                 continue
-            configs = choices.values()
             holder, _, last = key.rpartition(".")
             while holder and not any(has_key(config, holder) for config in configs):
                 holder, _, last = holder.rpartition(".")
@@ -162,28 +153,60 @@ class _Expansion:
             target = next(filter(None, targets), None)
             raise unknown_field(name, target, names) if target else unknown_setting(name, names)
 
-    def _compose(self, picks: Sequence[Pick]) -> tuple[DictConfig, list[Axis]]:
+    def _compose(
+        self, axes: Sequence[Axis], fixed: Mapping[int, str]
+    ) -> tuple[DictConfig, list[Axis]]:
         """Return the configuration, and the axes whose key this choice lacks."""
-        composed = self.composer.attempt(picks)
-        lacking = [] if composed is not None else self._lacking(picks)
+        overrides = _in_order(axes, fixed)
+        composed = self.composer.attempt(overrides)
+        lacking = [] if composed is not None else self._lacking(axes, fixed)
         if lacking:
-            picks = [one for one in picks if one[0] not in lacking]
-            composed = self.composer.attempt(picks)
-        return composed or self.composer.by_hydra(_words(picks)), lacking
+            kept = [axis for axis in axes if axis not in lacking]
+            composed = self.composer.compose(_in_order(kept, fixed))
+        return composed or self.composer.by_hydra(overrides), lacking
 
-    def _lacking(self, picks: Sequence[Pick]) -> list[Axis]:
-        bare = self.composer.attempt([one for one in picks if not one[0].replaces])
-        replacing = (axis for axis, _ in picks if axis.replaces)
+    def _lacking(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[Axis]:
+        replacing = [axis for axis in axes if axis.replaces]
+        others = [axis for axis in axes if axis not in replacing]
+        bare = self.composer.attempt(_in_order(others, fixed))
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
 
+    def _one_by_one(
+        self, axes: Sequence[Axis], fixed: Mapping[int, str], scalars: Sequence[Axis]
+    ) -> Iterator[Combination]:
+        """Compose each combination: a swept key holds a typed or structured value."""
+        for picks in itertools.product(*(range(len(axis.texts)) for axis in scalars)):
+            every = {**fixed, **_arguments(scalars, picks)}
+            composed = self.composer.compose(_in_order(axes, every))
+            overrides = tuple(every[axis.place] for axis in axes if axis.swept)
+            yield Combination(
+                _ScalarOverrides(composed, [], self.sections).settings([]), None, overrides
+            )
 
-def _words(picks: Iterable[Pick]) -> list[str]:
-    """Return the overrides that set one value of each axis."""
-    return [axis.argument(pick) for axis, pick in picks]
+
+def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[int, str]:
+    return {axis.place: axis.argument(pick) for axis, pick in zip(axes, picks, strict=True)}
 
 
-def _choices(picks: Iterable[Pick]) -> list[Pick]:
-    return [(axis, pick) for axis, pick in picks if axis.chooses(pick)]
+def _in_order(axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[str]:
+    """Return an override for each axis: the one in ``fixed``, or the first value."""
+    return [fixed.get(axis.place) or axis.argument(0) for axis in axes]
+
+
+def _overlaid(
+    overlay: _ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...]
+) -> Iterator[Combination]:
+    """Yield one combination per set of values; seeds stay together if nothing depends on them."""
+    together = [axis for axis in scalars if axis.key == "seed" and overlay.free("seed")]
+    ranges = [range(1 if axis in together else len(axis.texts)) for axis in scalars]
+    for picks in itertools.product(*ranges):
+        chosen = list(zip(scalars, picks, strict=True))
+        yield Combination(
+            settings=overlay.settings([axis.values[pick] for axis, pick in chosen]),
+            seeds=together[0].values if together else None,
+            overrides=overrides
+            + tuple(axis.argument(pick) for axis, pick in chosen if axis not in together),
+        )
 
 
 class _Composer:
@@ -199,38 +222,38 @@ class _Composer:
         self._name = settings.job.config_name
         self._own = list(settings.overrides.hydra)
         self._usual = not settings.searchpath
+        self._parsed: dict[str, Override] = {}
+        self._is_group: dict[str, bool] = {}
         self._options: dict[str, DictConfig | None] = {}
         self._frames: dict[tuple[str, ...], bytes] = {}
         self._latest: tuple[tuple[str, ...], bytes] = ((), b"")
+
+    def compose(self, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration for overrides without sweeps."""
+        return self.attempt(overrides) or self.by_hydra(overrides)
 
     def by_hydra(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration that Hydra composes, or raise its error."""
         return hydra.compose(self._name, [*self._own, *overrides])
 
-    def attempt(self, picks: Sequence[Pick]) -> DictConfig | None:
+    def attempt(self, overrides: Sequence[str]) -> DictConfig | None:
         """Return the configuration, or None if Hydra has to compose it or raise an error."""
         with contextlib.suppress(Exception):
-            choices = _choices(picks)
-            key = tuple(_words(choices))
+            parsed = [self._override(word) for word in overrides]
+            choices = [one for one in parsed if self._is_choice(one)]
+            key = tuple(str(one.input_line) for one in choices)
             if not self._latest[1] or self._latest[0] != key:
                 self._latest = key, pickle.dumps(self._chosen(choices))
             config: DictConfig = pickle.loads(self._latest[1])
-            for axis, pick in picks:
-                if not axis.chooses(pick):
-                    _apply(axis.override, axis.values[pick], config)
+            for one in parsed:
+                if not self._is_choice(one):
+                    _apply(one, config)
             return config
         return None
 
-    def _chosen(self, choices: Sequence[Pick]) -> DictConfig:
+    def _chosen(self, choices: Sequence[Override]) -> DictConfig:
         """Return the configuration for choices of groups."""
-        with contextlib.suppress(Exception):  # such as of an option that overrides another group
-            return self._exchanged(choices)
-        return self.by_hydra(_words(choices))
-
-    def _exchanged(self, choices: Sequence[Pick]) -> DictConfig:
-        """Return the configuration in which options are put into their sections."""
-        options = {axis.override.key_or_group: self._option(axis, pick) for axis, pick in choices}
-        alone = {group: option for group, option in options.items() if option}
+        alone = {one.key_or_group: self._option(one) for one in choices if self._option(one)}
         frame = self._frame(choices, alone)
         written = [group for group in alone if group in frame]
         if written:  # other files write to these sections
@@ -241,23 +264,23 @@ class _Composer:
                 frame[group] = option
         return frame
 
-    def _frame(self, choices: Sequence[Pick], absent: Collection[str]) -> DictConfig:
+    def _frame(self, choices: Sequence[Override], absent: Iterable[str]) -> DictConfig:
         """Return the configuration for choices, composed without some of their groups."""
-        groups = [axis.override.key_or_group for axis, _ in choices]
-        pairs = zip(groups, _words(choices), strict=True)
-        words = tuple(f"~{group}" if group in absent else word for group, word in pairs)
+        words = tuple(
+            f"~{one.key_or_group}" if one.key_or_group in absent else str(one.input_line)
+            for one in choices
+        )
         if words not in self._frames:
             self._frames[words] = pickle.dumps(self.by_hydra(words))
         frame: DictConfig = pickle.loads(self._frames[words])
         return frame
 
-    def _option(self, axis: Axis, pick: int) -> DictConfig | None:
+    def _option(self, choice: Override) -> DictConfig | None:
         """Return the content of an option that has no defaults and fills the section of its group.
 
         It is None for every other option.
         """
-        choice, option = axis.override, axis.values[pick]
-        group = choice.key_or_group
+        group, option = choice.key_or_group, choice.value()
         if choice.type != OverrideType.CHANGE or choice.package or not isinstance(option, str):
             return None
         path = f"{group}/{option}"
@@ -270,25 +293,91 @@ class _Composer:
             self._options[path] = content if plain else None  # type: ignore[assignment]
         return self._options[path]
 
+    def _is_choice(self, override: Override) -> bool:
+        """Return whether an override chooses an option of a group, as Hydra decides it."""
+        group = override.key_or_group
+        if group not in self._is_group:
+            options = self.loader.get_group_options(group, results_filter=None)
+            self._is_group[group] = bool(options)
+        return self._is_group[group] and not isinstance(override.value(), dict)
 
-def _apply(override: Override, value: object, config: DictConfig) -> None:
+    def _override(self, word: str) -> Override:
+        if word not in self._parsed:
+            [self._parsed[word]] = parsed_overrides([word], self.loader)
+        return self._parsed[word]
+
+
+def _apply(override: Override, config: DictConfig) -> None:
     """Set a value in a configuration; raise if only Hydra can, or if it has to refuse it."""
-    key, kind = override.key_or_group, override.type
-    new = kind == OverrideType.ADD and not has_key(config, key)
-    if override.package or not (new or kind in (OverrideType.CHANGE, OverrideType.FORCE_ADD)):
+    forced = override.type == OverrideType.FORCE_ADD
+    if override.package or not (forced or override.type == OverrideType.CHANGE):
         raise ConfigCompositionException(str(override.input_line))
-    added = kind != OverrideType.CHANGE
-    OmegaConf.update(config, key, value, merge=True, force_add=added)
+    OmegaConf.update(config, override.key_or_group, override.value(), merge=True, force_add=forced)
 
 
-def _is_alone(config: DictConfig, key: str) -> bool:
-    """Return whether no setting of a trial refers to a top-level key, as far as texts tell."""
-    names = [name for name in map(str, config) if name not in NOT_SWEPT]
-    plain = (_REFERENCE, _ENVIRONMENT)
-    return all(
-        key not in text and any(form.fullmatch(text) for form in plain)
-        for _, text in _interpolations(config, names)
-    )
+class _ScalarOverrides:
+    """Composed configuration in which the scalars at ``keys`` change.
+
+    Plain references such as ``model.width: ${width}`` are tracked by name; OmegaConf resolves any
+    other interpolation again each time.
+
+    Parameters
+    ----------
+    config
+        Configuration that was composed with some value for each of the keys.
+    keys
+        Dotted keys of the scalars.
+    sections
+        Top-level keys that the settings hold.
+    """
+
+    def __init__(self, config: DictConfig, keys: Sequence[str], sections: Sequence[str]) -> None:
+        self._config = config
+        self._keys = list(keys)
+        present = [key for key in sections if key in config.keys()]  # noqa: SIM118
+        self._base = {key: _resolved(config, key) for key in present}
+        references = list(_interpolations(config, present))
+        self._paths = {key: [key] for key in keys}
+        self._computed = [path for path, raw in references if not self._follow(path, raw)]
+
+    @property
+    def applicable(self) -> bool:
+        """Whether every key holds an untyped scalar, so that it accepts any value."""
+        return all(type(_node(self._config, key)) is AnyNode for key in self._keys)
+
+    def free(self, key: str) -> bool:
+        """Return whether no other key depends on ``key``."""
+        return not self._computed and self._paths.get(key) == [key]
+
+    def settings(self, values: Sequence[object]) -> Settings:
+        """Return the resolved sections with one value for each key."""
+        changes = dict(zip(self._keys, values, strict=True))
+        result = dict(self._base)
+        fresh: set[str] = set()
+        for key, value in changes.items():
+            for path in self._paths[key]:
+                _put(result, path, value, fresh)
+        if self._computed:
+            for key, value in changes.items():
+                OmegaConf.update(self._config, key, value)
+            for path in self._computed:
+                _put(result, path, _resolved(self._config, path), fresh)
+        return result
+
+    def _follow(self, path: str, raw: str) -> bool:
+        """Return whether ``path`` is constant, or equal to one of the keys."""
+        if _ENVIRONMENT.fullmatch(raw):
+            return True
+        match = _REFERENCE.fullmatch(raw)
+        if match is None:
+            return False
+        if match[1] in self._paths:
+            self._paths[match[1]].append(path)
+            return True
+        target = _node(self._config, match[1])
+        if target is None or isinstance(target, Container):
+            return False
+        return not target._is_interpolation() or self._follow(path, str(target._value()))
 
 
 def _interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -306,6 +395,12 @@ def _interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterato
             yield from _interpolations(child, inner, f"{path}.")
 
 
+def _node(config: DictConfig, key: str) -> Any:
+    parent, _, last = key.rpartition(".")
+    holder = OmegaConf.select(config, parent) if parent else config
+    return holder._get_node(last) if isinstance(holder, DictConfig) else None
+
+
 def has_key(config: DictConfig, key: str) -> bool:
     """Return whether a dotted key, or an entry of a list, exists, whatever its value."""
     parent, _, last = key.rpartition(".")
@@ -313,7 +408,7 @@ def has_key(config: DictConfig, key: str) -> bool:
         holder = OmegaConf.select(config, parent) if parent else config
         if isinstance(holder, ListConfig):
             return last.isdecimal() and int(last) < len(holder)
-        return isinstance(holder, DictConfig) and holder._get_node(last) is not None
+        return _node(config, key) is not None
     return False
 
 
@@ -322,6 +417,26 @@ def _resolved(config: DictConfig, path: str) -> Any:
     if isinstance(value, Container):
         return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
     return value
+
+
+def _put(result: Settings, path: str, value: object, fresh: set[str]) -> None:
+    """Set a path in nested dicts; dicts not in ``fresh`` are shared, and are copied first."""
+    *parents, last = path.split(".")
+    if (parents or [last])[0] not in result:
+        return
+    holder: Any = result
+    for depth, key in enumerate(parents):
+        index = _index(holder, key)
+        trail = ".".join(parents[: depth + 1])
+        if trail not in fresh:
+            holder[index] = holder[index].copy()
+            fresh.add(trail)
+        holder = holder[index]
+    holder[_index(holder, last)] = value
+
+
+def _index(holder: object, key: str) -> Any:
+    return int(key) if isinstance(holder, list) else key
 
 
 def _keys_below(config: DictConfig, holder: str) -> Iterable[str]:

@@ -22,7 +22,7 @@ from fnmatch import fnmatchcase
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
@@ -45,7 +45,7 @@ from hydra.errors import (
     MissingConfigException,
     OverrideParseException,
 )
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from dopt.errors import DoptError, SpecificationError, suggestion, unknown_name
@@ -66,34 +66,33 @@ class Axis:
 
     Attributes
     ----------
-    override
-        Key or group, type and package, by Hydra's grammar.
+    key
+        Configuration key or group as typed, with its prefix ``+``, ``++`` or ``~`` and its package.
     texts
         The values as Hydra would write them after the equals sign.
     values
         The values, typed by Hydra's grammar.
-    is_group
-        Whether the key is a group, of which a value that is no mapping chooses an option.
+    kind
+        ``choice`` of a group, ``scalar`` that replaces a value, or ``edit``: any other change of
+        the composed configuration, such as ``+k=1``, a list or a deletion.
+    place
+        Number of the override in its order.
     """
 
-    override: Override
+    key: str
     texts: tuple[str, ...]
     values: tuple[object, ...]
-    is_group: bool
+    kind: Literal["choice", "scalar", "edit"]
+    place: int = 0
 
     @property
-    def key(self) -> str:
-        """Key as typed, with its prefix ``+``, ``++`` or ``~`` and its package."""
-        return str(self.override.get_key_element())
+    def swept(self) -> bool:
+        return len(self.texts) > 1
 
     @property
     def replaces(self) -> bool:
-        """Whether the override sets an existing key: no option, and without ``+`` or ``~``."""
-        return not all(map(self.chooses, range(len(self.values)))) and self.key[0] not in "+~"
-
-    def chooses(self, index: int) -> bool:
-        """Return whether value ``index`` is an option of a group."""
-        return self.is_group and not isinstance(self.values[index], dict)
+        """Whether the override sets an existing key: not a group, and without ``+`` or ``~``."""
+        return self.kind != "choice" and self.key[0] not in "+~"
 
     def argument(self, index: int) -> str:
         """Return the override that sets value ``index``."""
@@ -118,7 +117,8 @@ def read_axes(loader: ConfigLoader, arguments: Sequence[str]) -> list[Axis]:
         merged = _is_mapping(one)
         kept = [k for k in kept if k.get_key_element() != key or (merged and _is_mapping(k))]
         kept.append(one)
-    return [_axis(loader, one) for one in kept]
+    axes = [dataclasses.replace(_axis(loader, one), place=i) for i, one in enumerate(kept)]
+    return [_without_clash(axis, axes) for axis in axes]
 
 
 def parsed_overrides(
@@ -206,6 +206,7 @@ def _range_values(sweep: RangeSweep) -> list[int] | list[float]:
 
 
 def _axis(loader: ConfigLoader, override: Override) -> Axis:
+    key = override.get_key_element()
     texts: tuple[str, ...]
     values: tuple[object, ...]
     value: object = override.value()
@@ -220,12 +221,15 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         _check_key(override)
         found = _swept_values(override)
         texts = tuple(map(_text, found))
-        values = tuple(map(Override._convert_value, found))
+        values = tuple(one.text if isinstance(one, QuotedString) else one for one in found)
     options = loader.get_group_options(override.key_or_group, results_filter=None)
-    if options and None in values:
-        names = _every_option(loader, override.key_or_group)
-        raise unknown_name(override.key_or_group, "null", names)
-    return Axis(override, texts, values, bool(options))
+    if options and not any(isinstance(value, dict) for value in values):
+        if None in values:
+            names = _every_option(loader, override.key_or_group)
+            raise unknown_name(override.key_or_group, "null", names)
+        return Axis(key, texts, values, "choice")
+    scalar = override.type == OverrideType.CHANGE and override.package is None
+    return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
 
 
 def _check_key(override: Override) -> None:
@@ -303,6 +307,26 @@ def _text(value: Any) -> str:
     if isinstance(value, str) and parsed_overrides([f"k={text}"])[0].value() != value:
         return QuotedString(value, Quote.single).with_quotes()
     return text
+
+
+def _plain(value: object) -> bool:
+    """Return whether ``value`` is a plain value, with no interpolation."""
+    if isinstance(value, str):
+        return "${" not in value and value != "???"
+    return value is None or isinstance(value, bool | int | float)
+
+
+def _without_clash(axis: Axis, axes: Sequence[Axis]) -> Axis:
+    """Turn a scalar into an edit if another override changes the same part of the tree."""
+    edits = (_path(other.key) for other in axes if other is not axis and other.kind != "choice")
+    pairs = (zip(_path(axis.key), edit, strict=False) for edit in edits)
+    if axis.kind == "scalar" and any(all(a == b for a, b in one) for one in pairs):
+        return dataclasses.replace(axis, kind="edit")
+    return axis
+
+
+def _path(key: str) -> list[str]:
+    return key.lstrip("+~").split("@")[0].split(".")
 
 
 CONFIGURATION = Path(__file__).resolve().parents[1] / "conf"
@@ -442,6 +466,37 @@ def _unknown_key(cause: OmegaConfBaseException) -> str:
     if isinstance(parent, DictConfig) and TARGET in names:
         return str(unknown_field(key, str(parent[TARGET]), names))
     return str(unknown_setting(key, names))
+
+
+def check_launch(launch: Mapping[str, object]) -> None:
+    """Refuse an unknown setting of the launch, its store or its executor.
+
+    Parameters
+    ----------
+    launch
+        The sections ``launch``, ``store`` and ``executor`` in plain types.
+    """
+    executor = launch["executor"]
+    name = executor.get("name") if isinstance(executor, Mapping) else None
+    _check("launch", launch["launch"], content_of(CONFIGURATION / "config.yaml").get("launch"))
+    _check("store", launch["store"], {"url": None})
+    _check("executor", executor, content_of(CONFIGURATION / "executor" / f"{name}.yaml"))
+
+
+def _check(path: str, given: object, known: object) -> None:
+    if not isinstance(given, Mapping) or not isinstance(known, Mapping) or not known:
+        return
+    for key, value in given.items():
+        if key not in known:
+            raise unknown_name(f"setting of {path}", key, map(str, known))
+        _check(f"{path}.{key}", value, known[key])
+
+
+@functools.cache
+def content_of(path: Path) -> Mapping[str, Any]:
+    """Return the content of a file; empty for an option outside this folder."""
+    content = OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else {}
+    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
 
 
 def unknown_setting(key: str, names: Iterable[str]) -> SpecificationError:

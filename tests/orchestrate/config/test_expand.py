@@ -402,6 +402,10 @@ def test_repeated_mappings_are_swept_together(hydra_settings: DictConfig) -> Non
     assert [one.settings["new"] for one in found] == [
         {"a": a, "b": b} for a in (1, 2) for b in (3, 4)
     ]
+    assert [one.overrides for one in found][:2] == [
+        ("++new={a:1}", "++new={b:3}"),
+        ("++new={a:1}", "++new={b:4}"),
+    ]
 
 
 NAMES = ("plain", "random", "far/exact", "far/random", "far/trace", "near/plain")
