@@ -20,11 +20,13 @@ import reprlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
-from dopt.errors import DoptError
+from dopt.errors import DoptError, SpecificationError
+from dopt.limits import Limits
 from dopt.registry import SOURCE, TARGET
-from dopt.spec.config import difference, flatten, section_name, unusual
-from dopt.spec.trial import is_fit
+from dopt.spec.config import difference, flatten
+from dopt.spec.trial import TrialSpec, is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
 
 
@@ -222,10 +224,39 @@ def nearness(config: ConfigRow) -> tuple[int, int, int, bool]:
     not defaults of what is named, then no task: it changes nothing of the trial. Last come stored
     sample losses.
     """
-    own = {key: part for key, part in config.config.items() if key not in ("task", "assess")}
-    names = [section_name(own, section) != name for section, name in USUAL.items()]
-    task, sampled = (bool(config.config.get(key)) for key in ("task", "assess"))
-    return -sum(names), -len(unusual(own)), -task, sampled
+    usual, parts = defaults(config), _sections(config)
+    task = parts.pop("task", None) is not None
+    sampled = parts.pop("assess", None) is not None
+    own = flatten(parts) if usual else {}
+    names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
+    return (
+        -sum(names),
+        -sum(usual.get(path) != value for path, value in own.items()),
+        -task,
+        sampled,
+    )
+
+
+def defaults(config: ConfigRow) -> dict[str, object]:
+    """Return the defaults of what a configuration names, without its task, as dotted paths.
+
+    Of limits, all settings except the name: a configuration without limits is nearer than one with
+    any. Empty if the system or the policy is a user's class, which is not registered here.
+    """
+    names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
+    for key in ("task", "assess"):
+        names.pop(key, None)
+    limits = Limits().to_section() if names.pop("limits", None) else {}
+    limits.pop("name", None)
+    try:
+        usual = TrialSpec.from_mapping(names).to_mapping()
+        return flatten({**usual, "limits": limits})
+    except (SpecificationError, KeyError):  # a plant is more than its name
+        return {}
+
+
+def _sections(config: ConfigRow) -> dict[str, Mapping[str, Any]]:
+    return {key: value for key, value in config.config.items() if isinstance(value, Mapping)}
 
 
 def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:

@@ -484,14 +484,18 @@ def flatten(config: Mapping[str, object], prefix: str = "") -> dict[str, object]
 def difference(configs: Sequence[Mapping[str, object]]) -> tuple[str, list[object]]:
     """Return the first dotted path in which configurations differ, and its values.
 
-    One that all of them have goes before one that some lack.
+    One that all of them have goes before one that some lack, a name before what comes with it.
     """
     flat = [flatten(config) for config in configs]
     known = set().union(*flat)
     paths = [path for path in known if any(one.get(path) != flat[0].get(path) for one in flat)]
     if not paths:
         return "config_key", [None for _ in configs]
-    path = min(paths, key=lambda one: (not all(one in entry for entry in flat), one))
+
+    def order(path: str) -> tuple[bool, bool, str]:
+        return not all(path in one for one in flat), not path.endswith((".name", TARGET)), path
+
+    path = min(paths, key=order)
     return path, [entry.get(path) for entry in flat]
 
 

@@ -40,6 +40,7 @@ OVERRIDES = {
     "policy": ["policy=plain,oracle", "policy=glob(*)", "policy=oracle", "policy=cramped,free"],
     "model": ["model=mlp", "model=linear,mlp", "model=shaped,linear"],
     "seed": ["seed=range(3)", "seed=7", "seed=choice(1,5)", "seed=sort(3,1,reverse=true)"],
+    "forced": ["++seed=4,5", "++seed=6"],
     "width": ["width=8,16", "width=range(4,9,2)", "width=choice(4)", "width=float(4,5)"],
     "scale": ["scale=0.5,1e-3", "scale=range(0,0.3,0.1)", "scale=inf,-1.0"],
     "env.dt": ["env.dt=0.01,0.02", "env.dt=null", "env.dt='${scale}',0.1", "env.dt=${width}"],
