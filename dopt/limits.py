@@ -143,11 +143,14 @@ def names_of(labels: Sequence[str]) -> list[str]:
 
 def _named(key: str, given: object) -> list[tuple[str, Any]]:
     """Return what a mapping, or tuples that begin with a name, give for each name."""
-    if isinstance(given, tuple):
-        return [(str(name), rest if len(rest) > 1 else rest[0]) for name, *rest in given]
-    if not isinstance(given, Mapping | None):
+    if isinstance(given, Mapping | None):
+        return [(str(name), value) for name, value in (given or {}).items()]
+    entries: list[Any] = [None]
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        entries = [*given]
+    if not all(isinstance(one, Sequence) and len(one) > 1 for one in entries):
         raise _unlike(key, given, "a mapping of names")
-    return [(str(name), value) for name, value in (given or {}).items()]
+    return [(str(name), rest if len(rest) > 1 else rest[0]) for name, *rest in entries]
 
 
 def _interval(name: str, given: object) -> Interval:

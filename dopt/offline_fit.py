@@ -189,7 +189,7 @@ def fit_offline(
                 f"each sample."
             )
         u = rows_of("inputs", inputs, spec.system.n_inputs)
-    given = {"states": x, "accelerations": y} | ({} if u is None else {"inputs": u})
+    given = {"accelerations": y, "states": x} | ({} if u is None else {"inputs": u})
     for what, values in given.items():
         check_finite(what, values)
         if len(values) != len(x) or not len(x):

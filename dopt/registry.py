@@ -68,16 +68,19 @@ def build_optional(section: str, registry: Mapping[str, type[T]], given: object)
     SpecificationError
         As :func:`build`; also if it is no section, or one of the name "none" has other keys.
     """
-    first = next(iter(registry))
-    if not isinstance(given, Mapping | Validated | None):
+    first, kinds = next(iter(registry)), tuple(registry.values())
+    if not isinstance(given, (Mapping, *kinds, type(None))):
         raise SpecificationError(
             f"configuration key '{section}' is {given!r}, but a section with a name and fields is "
             f"expected: choose {section}={first}, or {section}=none."
         )
-    if given is None or isinstance(given, Validated):
+    if not isinstance(given, Mapping):
         return cast("T | None", given)
     if given.get("name") != "none":
-        return build(section, registry, given if TARGET in given else {"name": first, **given})
+        named = {"name": first, **given} if given and TARGET not in given else given
+        if isinstance(name := named.get("name"), str) and name not in registry:
+            raise unknown_name(section, name, [*registry, "none"])
+        return build(section, registry, named)
     if others := ", ".join(key for key in map(str, given) if key != "name"):
         raise SpecificationError(
             f"{section}=none has {others}, but no other key than its name is expected: leave it "

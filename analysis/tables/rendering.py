@@ -41,6 +41,7 @@ from dopt.result import Assessment
 from orchestrate.store import QueryError, Reader
 
 _IN_LATEX = {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
+_IN_LATEX |= {"[": "{[}", "|": "$|$"}
 _IN_LATEX |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
 
 _SIGNS = str.maketrans({"±": "+-", "×": "x", "≤": "<=", "≥": ">=", "–": "-", "−": "-", "‖": "|"})
@@ -81,10 +82,10 @@ class TextTable:
 
 
 def _latex_letter(letter: str) -> str:
-    if letter.isascii():
-        return letter
     if letter in _IN_LATEX:
         return _IN_LATEX[letter]
+    if letter.isascii():
+        return letter
     name = unicodedata.name(letter, "")
     if name.startswith("GREEK SMALL LETTER "):
         return rf"$\{name.rpartition(' ')[2].lower().replace('lamda', 'lambda')}$"

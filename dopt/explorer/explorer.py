@@ -507,6 +507,7 @@ class Explorer(Explored):
         try:
             with uninterrupted(), self._lock:
                 self._wait()
+                self._state.finish()
         finally:
             self._planner.close()
             if self._fits is not None:

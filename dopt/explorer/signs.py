@@ -11,7 +11,7 @@ Free runs over the last steps are predicted by the learned model, and by the kno
 a low-pass filter estimates the states, they begin, end and are driven as it has them, late alike.
 
 Tests take as long as several steps of a plant. A part of one is done after each learned step, with
-the model and the states as they were when it began, and what is left after the last step of all.
+the model and the states as they were when it began, and what is left at the end.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import numpy as np
 from dopt.control.planning import predict, relative_error
 from dopt.explorer.journal import Event
 from dopt.learning import SimulationError
+from dopt.log import count_text
 from dopt.models.gaussian_process import GaussianProcess
 from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
@@ -93,11 +94,11 @@ _TEXTS = {
     "correct the model (%s): raise the regularization or the noise variance of the learner, or "
     "take another one such as 'adam_window'",
     "late": "the errors of the predictions follow from inputs of earlier steps, most from the one "
-    "%d samples before (together %.0f %% of their squares), but the plant is expected to answer at "
+    "%s before (together %.0f %% of their squares), but the plant is expected to answer at "
     "once, or as declared: declare Plant(delay=..., lag=...), or let learner='simulation_error' "
     "fit them (dopt.unknown)",
     "early": "the errors of the predictions follow from inputs that are not to act yet, most from "
-    "the one %d samples before (together %.0f %% of their squares), but the plant is expected to "
+    "the one %s before (together %.0f %% of their squares), but the plant is expected to "
     "answer as late as declared: declare a shorter delay, or let learner='simulation_error' fit it "
     "(dopt.unknown)",
     "worse": "%d steps ahead the learned model predicts with %.3g times the error of the known "
@@ -186,12 +187,18 @@ class Signs:
             self._begin(self._compare_runs(state))
         if done == AFTER:
             self._measure_box(state)
-        while self._tests:
+        if done == self._spec.system.horizon:
+            self.finish()
+        elif self._tests:
             has_ended = next(self._tests[0], True)
             if has_ended:
                 self._tests.popleft()
-            if done < self._spec.system.horizon:
-                break
+
+    def finish(self) -> None:
+        """Do what is left of the tests."""
+        while self._tests:
+            for _ in self._tests.popleft():
+                pass
 
     def find_supply(self, state: Exploration, level: float) -> None:
         """Count a fit that found a supply which the plant does not declare."""
@@ -309,8 +316,8 @@ class Signs:
             *rows, later = zip(*self._rows, strict=True)
             n = min(part.shape[-1] for part in later)
             rows.append(tuple(part[..., :n] for part in later))
-            yield from self._test(state, [*map(np.concatenate, rows)])
             self._rows = []
+            yield from self._test(state, [*map(np.concatenate, rows)])
 
     def _flow(self, system: System, parameters: Array, x: Array, u: Array) -> Array:
         """Return the mean accelerations of a predicted step, (n, r)."""
@@ -337,8 +344,9 @@ class Signs:
                 if share > largest:
                     largest, said = share, (sign, first + most)
         if largest >= EXPLAINED:
-            state.counts[said[0]] += 1
-            self._say(*said, 100.0 * largest)
+            sign, samples = said
+            state.counts[sign] += 1
+            self._say(sign, count_text(samples, "sample"), 100.0 * largest)
 
     def _measure_box(self, state: Exploration) -> None:
         """Count the sides of the box of which the states so far cover little."""

@@ -398,6 +398,10 @@ class ExplorerState:
         self.steps.replace(np.array(event["refit"]), np.array(event["fitted"][:-2]))
         self.flight = self.flight.retimed(self.system)
 
+    def finish(self) -> None:
+        """Do what is left of the tests for signs that the exploration fails."""
+        self._signs.finish()
+
     def may_replay(self, event: Event) -> bool:
         """Return True if an event of a journal can follow the present state."""
         needs_state = event.keys() & {"learn", "plan", "missed"}

@@ -511,9 +511,7 @@ class _Selection:
     def check_hold(self, found: Estimate, other: str, data: Data) -> None:
         """Note it where constants are others if inputs are interpolated in another way."""
         (model, before, s, covariance), windows = found, found.solution.windows
-        pieces = np.searchsorted(np.unique(self.data.firsts), windows.rows, side="right") - 1
-        parts = round((len(data.time) - 1) / (len(self.data.time) - 1))
-        windows = windows._replace(rows=parts * windows.rows - (parts - 1) * pieces)
+        windows = windows._replace(rows=same_rows(windows.rows, self.data, data))
         simulator = Simulator(model, data._replace(deviations=self.data.deviations))
         after = solve(simulator, windows, before.p, s, most=8, scale=before.scale)
         moved = np.abs(after.p - before.p) / np.sqrt(np.diag(covariance))
@@ -523,8 +521,17 @@ class _Selection:
             self.notes.append(
                 f"hold={other!r} fits better, and moves {model.names[most]} by {moved[most]:.2g} "
                 f"standard errors, which contain none of it: take it if inputs were measured"
-                f"{' and are smooth' * (other == 'cubic')}, or record them more often"
+                f"{' and are smooth' if other == 'cubic' else ''}, or record them more often"
             )
+
+
+def same_rows(rows: Integers, data: Data, other: Data) -> Integers:
+    """Return rows of data in others, whose steps between rows have another number of parts."""
+    firsts, others = np.unique(data.firsts), np.unique(other.firsts)
+    parts = (len(other.time) - len(others)) / (len(data.time) - len(firsts))
+    pieces = np.searchsorted(firsts, rows, side="right") - 1
+    moved: Integers = others[pieces] + np.round(parts * (rows - firsts[pieces])).astype(np.int64)
+    return moved
 
 
 def _gain(before: Array, after: Array) -> tuple[float, float]:

@@ -369,7 +369,10 @@ def improved(
 
 
 def gradient(problem: Problem, motion: Motion) -> list[Array]:
-    """Return by how much positions, velocities and accelerations lower the score, (T, n) each."""
+    """Return slopes that lower the score by positions, velocities, accelerations, (T, n) each.
+
+    Their penalty is smooth, and begins where an error exceeds its reference.
+    """
     unknowns, rate, n = problem.tangent, problem.rate, problem.body.n
     rows = unknowns.weighted(motion, rate)
     flat = rows.reshape(-1, len(unknowns))

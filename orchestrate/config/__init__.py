@@ -158,7 +158,7 @@ def setting(
     of_kind = isinstance(value, numbers) and (kind is bool or not isinstance(value, bool))
     if of_kind and holds(value):
         return kind(value)
-    raise wrong(key, value, f"{'null or ' * null}{expected}")
+    raise wrong(key, value, f"null or {expected}" if null else expected)
 
 
 def wrong(key: str, value: object, expected: str) -> LaunchError:
@@ -182,15 +182,19 @@ _mapping = partial(setting, kind=dict, expected="a section with settings of its 
 def section(key: str, value: object, names: Collection[str]) -> dict[str, Any]:
     """Return a section of settings, of which none is missing or unknown."""
     found: dict[str, Any] = _mapping(key, value)
+    _require(found, names)
+    for name in found:
+        if name not in names:
+            raise unknown_name(f"setting of {key}", name, names)
+    return found
+
+
+def _require(found: Mapping[str, Any], names: Iterable[str]) -> None:
     for name in names:
         if name not in found:
             raise LaunchError(
                 f"an override deletes '{name}', which a launch needs: leave that override out."
             )
-    for name in found:
-        if name not in names:
-            raise unknown_name(f"setting of {key}", name, names)
-    return found
 
 
 def factor(key: str, value: object, limit_key: str, limited: object) -> float | None:
@@ -310,6 +314,7 @@ class LaunchSettings:
         ray = section("launch.ray", launch["ray"], ("address",))
         store = section("store", given["store"], ("url",))
         executor = _mapping("executor", given["executor"])
+        _require(executor, ["name"])
         checked = {name: check(f"launch.{name}", launch[name]) for name, check in _CHECKS.items()}
         if checked["patience"] >= checked["lease"]:  # a launch gives up before its lease ends
             raise wrong(
@@ -317,7 +322,7 @@ class LaunchSettings:
             )
         return cls(
             **checked,
-            executor=text("executor.name", executor.pop("name", None)),
+            executor=text("executor.name", executor.pop("name")),
             store_url=stripped(text("store.url", store["url"]), "store.url", LaunchError),
             retry_memory=factor(
                 *("launch.retry_memory", launch["retry_memory"]),

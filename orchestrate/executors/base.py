@@ -264,7 +264,7 @@ def executor_factory(settings: LaunchSettings) -> ExecutorFactory:
     factory: ExecutorFactory = import_module(EXECUTORS[settings.executor]).FACTORY
     for name in settings.executor_options:
         if factory.options is not None and name not in factory.options:
-            raise unknown_name("setting of executor", name, factory.options)
+            raise unknown_name("setting of executor", name, [*factory.options, "name"])
     return factory
 
 

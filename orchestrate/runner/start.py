@@ -205,8 +205,15 @@ class _GridRun:
         with held as executor, Interrupt() as stop:
             start = time.monotonic()
             chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
-            more = settings.fail_fast, settings.retry_memory
-            scheduler = Scheduler(self.store, executor, chunks, tally, stop, *more)
+            scheduler = Scheduler(
+                self.store,
+                executor,
+                chunks,
+                tally,
+                stop,
+                settings.fail_fast,
+                settings.retry_memory,
+            )
             for stage, state in stages:
                 chunks.add(_waiting(stage, state))
                 scheduler.owned_by_others = state.running_elsewhere

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dopt import Explorer
+from dopt.control import Control
 from dopt.errors import IncompatibleError, ScaleWarning, SpecificationError
 from dopt.kernel.run import KernelTrial, SteppedTrial
 from dopt.kernel.structs import Record
@@ -164,7 +165,9 @@ WRONG = [
     ({"bounds": {"y": [-(10**400), 1]}}, r"limits\.bounds\.y is .* but a pair"),
     ({"rates": {"u": 10**400}}, r"limits\.rates\.u is .* but a number above 0"),
     ("rail", "configuration key 'limits' is 'rail', but a section"),
-    ({"name": "sphere"}, "limits 'sphere' is unknown"),
+    ({"name": "sphere"}, "limits 'sphere' is unknown.* one of box, none"),
+    ({"bounds": [("y",)]}, r"limits\.bounds is \[\('y',\)\], but a mapping of names"),
+    (Control(), "configuration key 'limits' is Control"),
 ]
 
 
@@ -173,6 +176,12 @@ def test_wrong_limits_are_refused_in_a_sentence(given: object, message: str) -> 
     with pytest.raises(SpecificationError, match=message) as caught:
         limited("cartpole", given)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("given", [{}, "control", Limits(bounds=(("y", -1.0, 1.0),))])
+def test_what_is_no_task_is_refused(given: object) -> None:
+    with pytest.raises(SpecificationError, match="task"):
+        TrialSpec.from_mapping({**trial("cartpole", "random").to_mapping(), "task": given})
 
 
 DEGREE = math.pi / 180

@@ -19,6 +19,7 @@ from analysis.serve.app import create_app
 from dopt import Explorer, encoder
 from dopt.control import planning
 from dopt.explorer.signs import SIGNS
+from dopt.log import count_text
 from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.types import Array
@@ -70,7 +71,7 @@ def test_an_undeclared_delay_is_said_in_samples(
         drive(one, STEPS, delay)
         assert one.counts["late"] == 2  # at steps 500 and 800
     [text] = [text for text in said(caplog) if "earlier steps" in text]
-    assert f"{delay} samples before" in text
+    assert f"{count_text(delay, 'sample')} before" in text
     with Explorer(
         dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random", steps=STEPS
     ) as one:
@@ -89,7 +90,7 @@ def test_a_delay_that_is_declared_too_long_is_said(
         drive(one, STEPS, delay)
         assert (one.counts["early"], one.counts["late"]) == (2, 0)
     [text] = [text for text in said(caplog) if "not to act yet" in text]
-    assert f"{delay} samples before" in text
+    assert f"{count_text(delay, 'sample')} before" in text
 
 
 def test_a_delay_that_a_fit_shortens_is_tested_on() -> None:
@@ -134,6 +135,14 @@ def test_a_step_does_a_small_part_of_a_test(monkeypatch: pytest.MonkeyPatch, hor
             each.append(sum(predicted))
     assert 0 < max(each[:-1]) <= 2 * signs_module.RUNS
     assert (each[-1] > max(each[:-1])) == (horizon == STEPS)
+
+
+def test_a_test_that_is_not_over_is_finished_at_the_end(caplog: pytest.LogCaptureFixture) -> None:
+    with explorer(steps=2 * STEPS) as one:
+        drive(one, 520, 2)
+        assert one.counts["late"] == 0
+    assert one.counts["late"] == 1
+    assert any("2 samples before" in text for text in said(caplog))
 
 
 def test_steps_that_all_begin_elsewhere_are_no_part_of_it() -> None:

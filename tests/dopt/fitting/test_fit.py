@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 import dopt
 from dopt.errors import SpecificationError
 from dopt.fitting import problem
+from dopt.fitting.fit import same_rows
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import Simulator, Windows, first_states, solve, windows_of
@@ -217,6 +218,20 @@ def test_an_input_that_was_measured_is_interpolated() -> None:
     seen = np.isfinite(linear.data.measured[:, 0])
     np.testing.assert_array_equal(linear.data.measured[seen], expected)
     assert np.abs(other[seen] - expected).max() < 0.01 * np.abs(one - expected).max()
+
+
+@pytest.mark.parametrize(("hold", "other"), [("zero", "linear"), ("linear", "cubic")])
+def test_rows_have_the_same_times_where_inputs_are_interpolated(hold: str, other: str) -> None:
+    rng = np.random.default_rng(0)
+    lengths = [5] * 60 + [2, 17, 40]
+    t = np.concatenate([10.0 * k + 0.02 * np.arange(n) for k, n in enumerate(lengths)])
+    table = {"t": t, "angle": rng.normal(size=len(t)), "rate": rng.normal(size=len(t))}
+    names = {"states": ["angle", "rate"], "inputs": ["voltage"], "angles": ["angle"]}
+    log = dopt.Log({**table, "voltage": rng.normal(size=len(t))}, **names)  # type: ignore[arg-type]
+    data, finer = (data_of(pendulum(), [log], one) for one in (hold, other))
+    rows = np.flatnonzero(np.isfinite(data.measured[:, 0])).reshape(-1, 1)
+    moved = same_rows(rows, data, finer)
+    np.testing.assert_array_equal(finer.measured[moved], data.measured[rows])
 
 
 def test_a_simulation_that_leaves_the_limit_counts_and_fails_nothing() -> None:
