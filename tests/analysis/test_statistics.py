@@ -310,7 +310,7 @@ def test_every_letter_of_a_label_compiles() -> None:
     assert text.startswith("% rad/s2\n% ")
     assert text.isascii()
     assert r"adam\_replay $\times$30 & $\gamma$=3 \& $\lambda$ & 50 \% of \#1 \{x\} & " in text
-    assert r"q1 \textasciitilde{} a\^{}b & [2, 3] m/s$^2$ \\" in text
+    assert r"q1 \textasciitilde{} a\^{}b & {[}2, 3] m/s$^2$ \\" in text
 
 
 def rng() -> np.random.Generator:
