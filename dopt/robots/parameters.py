@@ -264,7 +264,7 @@ class Unknowns:
         return result * self.scales
 
     def _inertial_directions(self) -> Array:
-        """Return changes of the inertial parameters with those of bodies, (10 · bodies, k)."""
+        """Return derivatives of the inertial parameters by unknowns of bodies, (10 · bodies, k)."""
         body, model = self.body, self.body.model
         ours = [one for one in self.parameters if one.kind not in OF_JOINTS]
         result = np.zeros((INERTIAL * len(body.bodies), len(ours)))
