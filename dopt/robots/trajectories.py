@@ -307,7 +307,7 @@ class Spline(Family):
             half, most = ROOM * (high - low) / 2.0, radius * (high - low)
             sizes = ROOM * np.array([limits.velocity[k], limits.acceleration[k]])
             largest = np.repeat(sizes, counts)
-            program = milp(
+            program = milp(  # a linear program: its rows have two sides
                 -slopes[:, k],
                 bounds=Bounds(
                     np.maximum(limits.middle[k] - half, points[:, k] - most),

@@ -106,15 +106,19 @@ class ExportError(DoptError):
 
 
 def export(
-    reader: Reader, configs: Sequence[ConfigRow], out: Path, arguments: argparse.Namespace
+    reader: Reader,
+    configs: Sequence[ConfigRow],
+    out: Path,
+    kind: str,
+    form: str,
+    filters: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
     """Write the file, and after it its manifest; return what the manifest says.
 
-    Both appear whole or not at all. ``reader`` sees the moment of ``configs``. Raises
-    ``ExportError``, or ``OutputError`` if they cannot be written.
+    Both appear whole or not at all. ``reader`` sees the moment of ``configs``; ``kind`` is one of
+    ``KINDS`` and ``form`` one of ``FORMATS``. Raises ``ExportError``, or ``OutputError`` if they
+    cannot be written.
     """
-    kind, form = arguments.kind, arguments.format
-    filters = {"env": arguments.env, "policy": arguments.policy}
     _expect_trials(reader, configs, kind)
     with whole(_manifest(out)) as manifest, whole(out) as partial:
         content = _write(reader, configs, kind, form, partial)
@@ -297,9 +301,11 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_export(arguments: argparse.Namespace) -> ExitCode:
     """Write the file and its manifest."""
     out = _target(arguments)
-    arguments.format = arguments.format or _format_of(out)
+    form = arguments.format or _format_of(out)
+    filters = {"env": arguments.env, "policy": arguments.policy}
     with Reader.open(arguments.db) as reader, reader.moment() as moment:
-        document = export(moment, chosen(moment, arguments), out, arguments)
+        configs = chosen(moment, arguments)
+        document = export(moment, configs, out, arguments.kind, form, filters)
     size = f"{document['rows']:,} rows, {document['bytes']:,} bytes"
     line = f"{out}: {size}; from where: {_manifest(out)}"
     return answer(arguments, document, line)

@@ -375,7 +375,7 @@ class _Rows:
 
 def _prepare(claim: Claim, result: TrialResult, run: RunRecord) -> _Rows:
     """Check a result and return its rows; raise ``InvalidResultError`` if it is invalid."""
-    for fault in _faults(result):
+    if fault := next(_faults(result), None):
         raise _refusal(claim.trial_key, fault)
     steps = np.column_stack([getattr(result, name) for name in STEP_VALUES]).astype(np.float64)
     steps[~np.isfinite(steps)] = np.nan

@@ -225,9 +225,10 @@ def test_rows_have_the_same_times_where_inputs_are_interpolated(hold: str, other
     rng = np.random.default_rng(0)
     lengths = [5] * 60 + [2, 17, 40]
     t = np.concatenate([10.0 * k + 0.02 * np.arange(n) for k, n in enumerate(lengths)])
-    table = {"t": t, "angle": rng.normal(size=len(t)), "rate": rng.normal(size=len(t))}
-    names = {"states": ["angle", "rate"], "inputs": ["voltage"], "angles": ["angle"]}
-    log = dopt.Log({**table, "voltage": rng.normal(size=len(t))}, **names)  # type: ignore[arg-type]
+    columns = {name: rng.normal(size=len(t)) for name in ("angle", "rate", "voltage")}
+    log = dopt.Log(
+        {"t": t, **columns}, states=["angle", "rate"], inputs=["voltage"], angles=["angle"]
+    )
     data, finer = (data_of(pendulum(), [log], one) for one in (hold, other))
     rows = np.flatnonzero(np.isfinite(data.measured[:, 0])).reshape(-1, 1)
     moved = same_rows(rows, data, finer)
@@ -430,7 +431,7 @@ def test_a_delay_is_found_as_far_as_it_was_declared_to_be(guess: Any, late: floa
 
 
 def test_a_delay_keeps_its_prior_as_other_constants_do() -> None:
-    """Its spread was that of one sample, whatever was declared."""
+    """Its spread was one sample, whatever was declared."""
     for declared_delay in (dopt.unknown(0.05, spread=1e-6), dopt.unknown(0.05, factor=1.00001)):
         found = dopt.fit(declared(delay=declared_delay), run(0, 600), width=0, window=0.6)
         assert found.constants["delay"][0] == pytest.approx(0.05, rel=0.01)
