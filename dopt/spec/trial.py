@@ -282,8 +282,13 @@ def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
     return section
 
 
-_EXAMPLES = {"env": "pendulum", "policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
-_EXAMPLES["plant"] = "real"
+_EXAMPLES = {
+    "env": "pendulum",
+    "policy": "d_optimal",
+    "model": "mlp",
+    "learner": "adam_window",
+    "plant": "real",
+}
 
 
 MARK = {"loss": "prequential"}
