@@ -107,7 +107,7 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
         for launch in detached:
             where = f"{launch.launch_id} on {launch.host}, {launch.started[:19]}Z"
             yield Text(f"  {where}: registered a grid for workers")
-        yield from map(_launch, status.launches)
+        yield from (_launch(launch, bool(status.left)) for launch in status.launches)
     if status.left and not status.launches:
         again = f"start workers with {WORK}" if detached else "run the same launch command again"
         yield Text(f"\nNo {'worker' if detached else 'launch'} is running: {again} to continue.")
@@ -126,7 +126,7 @@ def _failure(kind: FailureKind) -> Text:
     return text
 
 
-def _launch(launch: LaunchRow) -> Text:
+def _launch(launch: LaunchRow, unfinished: bool) -> Text:
     age = duration(max(0.0, seconds_since(launch.started, datetime.now(UTC))))
     since = f"{launch.started[:19]}Z"
     where = f"  {launch.launch_id} on {launch.host}, process {launch.pid}, since {since}"
@@ -136,7 +136,8 @@ def _launch(launch: LaunchRow) -> Text:
     hint = "run the same launch command again to continue"
     if worker:
         hint = "other workers take its trials"
-    return Text(f"{where}: ").append("dead", style="red").append(f"; {hint}")
+    dead = Text(f"{where}: ").append("dead", style="red")
+    return dead.append(f"; {hint}") if unfinished else dead
 
 
 def document(status: Status, database: str) -> dict[str, Any]:

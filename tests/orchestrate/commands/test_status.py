@@ -111,6 +111,22 @@ def test_a_dead_launch_is_called_dead(open_store: Callable[..., Store], command:
     assert command("status", "--json").document["launches"][0]["alive"] is False
 
 
+@on_both
+def test_a_dead_launch_that_left_nothing_has_nothing_to_continue(
+    open_store: Callable[..., Store], command: Run
+) -> None:
+    dead = open_store()
+    launch = dead.begin_launch(LAUNCH)
+    (claim,) = dead.claim(launch, dead.register(launch, [Spec()]).todo)
+    assert dead.commit(claim, result(), run_now())
+    dead.close()
+    with open_store()._backend.transaction() as connection:
+        connection.exec_driver_sql("UPDATE launch SET lease_until = 0")  # long ago, on PostgreSQL
+    said = command("status").out
+    assert ": dead" in said
+    assert "continue" not in said
+
+
 def test_without_a_launch_it_says_how_to_go_on(store: Store, command: Run) -> None:
     launch = store.begin_launch(LAUNCH)
     store.register(launch, [Spec()])
