@@ -338,7 +338,7 @@ class _Selection:
             if scores.mean() < best:
                 best, self.window = float(scores.mean()), length
                 self.solution, self._scores = whole, scores
-                self._folds["physics alone"] = self._folds["model"] = (self.model, folds)
+                self._folds["model"] = self._folds["physics alone"] = (self.model, folds)
 
     def choose_network(
         self, width: int, weights: Sequence[float], seed: int
@@ -364,8 +364,8 @@ class _Selection:
         gain, error = _gain(self._scores, scores)
         if not gain > error:
             self.notes.append(
-                f"no network: it lowers the loss on held-out blocks by {gain:.3f} ± {error:.3f} "
-                f"only"
+                f"no network: with it the loss on held-out blocks changes by {-gain:+.3f} ± "
+                f"{error:.3f}, which is no clear fall"
             )
             return None
         self._folds["model"], self._scores = (model, folds), scores

@@ -185,6 +185,9 @@ class Fitted:
     ) -> list[Simulation]:
         """Simulate the pieces of a log, each from a state that is fitted to its beginning.
 
+        Pieces that are not longer than the history are left out, and so are the first rows of a
+        piece, on which inputs before the log act: rows are matched by their ``time``.
+
         Parameters
         ----------
         run : Log, DataFrame or mapping
@@ -403,8 +406,8 @@ class Fitted:
         white = self.whiteness()
         for name, (own, other) in white.items():
             lines.append(
-                f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with "
-                f"an earlier input (0: white)."
+                f"Residuals of {name}: correlation {own:z.2f} with the row before, {other:z.2f} "
+                f"with an earlier input (0: white)."
             )
         if self.has_network or any(abs(own) > CORRELATED for own, _ in white.values()):
             lines.append("The equations lack something, which no standard error above contains.")

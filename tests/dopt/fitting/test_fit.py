@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 import pickle
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -324,8 +325,16 @@ def test_a_supply_that_is_not_declared_is_found(
 def test_a_network_is_refused_where_the_constants_tell_all() -> None:
     found = dopt.fit(declared(), run(5), width=6, weights=(10.0,))
     assert not found.has_network
-    assert "no network" in found.report()
-    assert "lack something" not in found.report()
+    report = found.report()
+    (constants, network) = (
+        min(loss for what, loss, _ in found.selection.table if what.startswith(begin))
+        for begin in ("constants", "and 6 units")
+    )
+    (changed,) = re.findall(r"no network: .* changes by ([+-][\d.]+) ± ", report)
+    assert float(changed) == pytest.approx(network - constants, abs=1e-3)
+    assert "lack something" not in report
+    assert "-0.00" not in report
+    assert [row["model"] for row in found.errors()[:1]] == ["model"], "what is used comes first"
 
 
 def test_a_network_is_kept_where_something_is_not_declared(fitted: Fitted) -> None:
