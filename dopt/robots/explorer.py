@@ -534,12 +534,15 @@ class RobotExplorer:
         """
         learner, unit, velocity = self.learner, self.limits.torque, self.limits.velocity
         values, half = (part * unit[:, None] for part in learner.intervals())
-        joints = {
+        joints: dict[str, dict[str, Any]] = {
             name: {
-                "coulomb": (values[j, -2], half[j, -2]),
-                "viscous": (values[j, -1] / velocity[j], half[j, -1] / velocity[j]),
-                "relative_width": half[j, :-2].max() / (learner.sizes()[j] * unit[j]),
-                "noise": learner.noise[j] * unit[j],
+                "coulomb": (float(values[j, -2]), float(half[j, -2])),
+                "viscous": (
+                    float(values[j, -1] / velocity[j]),
+                    float(half[j, -1] / velocity[j]),
+                ),
+                "relative_width": float(half[j, :-2].max() / (learner.sizes()[j] * unit[j])),
+                "noise": float(learner.noise[j] * unit[j]),
             }
             for j, name in enumerate(self.body.joints)
         }

@@ -300,7 +300,9 @@ def test_it_stops_when_every_interval_is_as_narrow_as_asked_for() -> None:
     trace = explore(robot, explorer, 1.0)
     assert np.abs(robot.v / limits.velocity).max() < 0.02
     assert len(trace.times) == 500 // LOOK
-    assert explorer.report()["seconds"] == pytest.approx(before + 1.0)
+    report = explorer.report()
+    assert report["seconds"] == pytest.approx(before + 1.0)
+    assert "np.float64" not in str(report), "it is printed"
 
 
 def test_a_payload_is_noticed_said_once_and_weighed() -> None:
