@@ -75,7 +75,7 @@ def _of_page(page: str) -> Iterator[Command]:
     lines = [line for block in blocks(text, "bash") for line in block.splitlines()]
     rest = _FENCE.sub("", text)
     lines += re.findall(r"`(python (?:-m|orchestrate/)[^`\n]*)`", rest)
-    lines += re.findall(r"^    ((?:PYTHONPATH=\S+ )?python .*)$", rest, flags=re.MULTILINE)
+    lines += re.findall(r"^    ((?:[A-Z_]+=\S+ )*python .*)$", rest, flags=re.MULTILINE)
     for line in lines:
         if words := shlex.split(re.sub(r"\$\([^)]*\)", "OUTPUT", line), comments=True):
             yield _command(page, words)
@@ -86,6 +86,7 @@ def _command(page: str, words: list[str]) -> Command:
     variables = dict(word.split("=", 1) for word in words[:first])
     program, *rest = words[first:]
     if program == "python":
+        rest = rest[2:] if rest[:2] == ["-m", "pdb"] else rest  # a program under the debugger
         program, rest = (rest[1], rest[2:]) if rest[0] == "-m" else (Path(rest[0]).name, rest[1:])
     return Command(page, variables, program, tuple(rest))
 
