@@ -15,13 +15,7 @@ import pandas as pd
 
 from analysis.data.matching import AnalysisError, latest, nearness
 from analysis.data.samples import bounded_states
-from analysis.data.selection import (
-    Selection,
-    absent_pairs,
-    environment_rank,
-    policy_rank,
-    ranges,
-)
+from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank, ranges
 from analysis.serve.web import QueryParams, RequestError, ServerState, read_progress, truncated
 from analysis.stats.curves import (
     Axis,

@@ -16,13 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.data.matching import (
-    AnalysisError,
-    Filter,
-    accepted,
-    latest_sources,
-    nearness,
-)
+from analysis.data.matching import AnalysisError, Filter, accepted, latest_sources, nearness
 from analysis.data.samples import coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
