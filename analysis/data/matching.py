@@ -225,7 +225,8 @@ def nearness(config: ConfigRow) -> tuple[int, int, int, bool]:
     task, sampled = parts.pop("task", None), parts.pop("assess", None)
     names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
     settings = unusual(parts) - {f"{section}.name" for section in USUAL}
-    return -sum(names), -len(settings), -(task is not None), sampled is not None
+    plant = "plant" in parts.get("env", {})  # which is unusual whatever its settings
+    return -sum(names), -len(settings) - plant, -(task is not None), sampled is not None
 
 
 def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:
