@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ import pandas as pd
 from analysis import log_report, report
 from analysis.data.matching import REFERENCE, AnalysisError, Filter, IncompleteError, read_condition
 from analysis.data.selection import Selection, select
-from analysis.outputs import NAMES, partial_warning
+from analysis.outputs import NAMES, build, partial_warning
 from analysis.serve import is_loopback
-from analysis.stats.curves import Axis, PlotOptions, Spread, Statistic
+from analysis.stats.curves import Axis, PlotOptions, Spread, Statistic, median_seed
 from analysis.stats.scores import Measure
+from analysis.style import counted
 from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
@@ -49,26 +51,23 @@ HOST = "127.0.0.1"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
-        return _run(parser().read(sys.argv[1:] if arguments is None else arguments))
+        options = parser().read(sys.argv[1:] if arguments is None else arguments)
+        return int(options.run(options))
     except IncompleteError as error:
         tell(sys.stderr, f"{error}\n")
         return 3
 
 
-def _run(options: argparse.Namespace) -> int:
-    if "alone" in options:
-        return int(options.alone(options))
+@contextmanager
+def _selected(options: argparse.Namespace) -> Iterator[tuple[Reader, Selection]]:
+    """Open the database and select trials; say what is left out, and refuse missing trials."""
     with Reader.open(options.db) as reader:
         selection = select(reader, wanted(options))
         if selection.gaps and not options.allow_partial:
             raise incomplete(selection.gaps, "a complete grid is", "--env and --policy")
-        _say_notes(selection)
-        return int(options.run(reader, selection, options))
-
-
-def _say_notes(selection: Selection) -> None:
-    for note in selection.notes:
-        tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
+        for note in selection.notes:
+            tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
+        yield reader, selection
 
 
 def parser() -> Parser:
@@ -116,9 +115,13 @@ def parser() -> Parser:
         table.set_defaults(table=kind)
     for command in (figures, compare):
         command.add_argument(
-            "--epsilon", type=float, help="loss to reach (median final loss of random inputs)"
+            "--epsilon",
+            type=positive("--epsilon", float),
+            help="loss to reach (median final loss of random inputs)",
         )
-    compared = _command(commands, "report", None, report.HELP)
+    compared = _command(
+        commands, "report", lambda options: report.run(options, wanted(options)), report.HELP
+    )
     for command in (figures, compare, aggregate, compared):
         command.add_argument(
             "--reference",
@@ -134,11 +137,10 @@ def parser() -> Parser:
             metavar="KEY",
             help="settings of which each value is shown once, such as width or env.gamma (policy)",
         )
-    report.add_arguments(compared)
-    compared.set_defaults(alone=lambda options: report.run(options, wanted(options)))
+    compared.add_argument("--out", type=path("--out"), default="report", help="folder (report/)")
     film = "a film of one stored trial: system, phase trace, learned and true force, loss"
     animate = commands.add_parser("animate", help=film, description=film)
-    animate.set_defaults(alone=_animate)
+    animate.set_defaults(run=_animate, allow_partial=True)
     add_database(animate)
     animate.add_argument("env", metavar="ENV", nargs=1, help="environment of the trial")
     animate.add_argument("policy", metavar="POLICY", nargs=1, help="policy of the trial")
@@ -150,10 +152,10 @@ def parser() -> Parser:
         animate.add_argument(option, type=number, default=default, help=f"{what} ({default})")
     recorded = commands.add_parser("log", help=log_report.HELP, description=log_report.HELP)
     log_report.add_arguments(recorded)
-    recorded.set_defaults(alone=log_report.run)
+    recorded.set_defaults(run=log_report.run)
     fitted = commands.add_parser("fit", help=log_report.FIT_HELP, description=log_report.FIT_HELP)
     log_report.add_fit_arguments(fitted)
-    fitted.set_defaults(alone=log_report.run_fit)
+    fitted.set_defaults(run=log_report.run_fit)
     _add_serve(commands)
     return top
 
@@ -211,28 +213,23 @@ def _plot_options(options: argparse.Namespace) -> PlotOptions:
     return PlotOptions(**given, epsilon=getattr(options, "epsilon", None))
 
 
-def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    from analysis.outputs import build  # Matplotlib: other commands do without it
-
+def _figures(options: argparse.Namespace) -> int:
+    asked = _plot_options(options), options.out, tuple(options.only or NAMES)
     empty = 0
-    for outcome in build(
-        *(reader, selection, _plot_options(options), options.out, tuple(options.only or NAMES)),
-        force=options.force,
-    ):
-        tell(sys.stdout, f"{options.out / outcome.name}: {outcome.state}\n")
-        empty += bool(options.only) and outcome.state.startswith("not drawn")
+    with _selected(options) as (reader, selection):
+        for outcome in build(reader, selection, *asked, force=options.force):
+            tell(sys.stdout, f"{options.out / outcome.name}: {outcome.state}\n")
+            empty += bool(options.only) and outcome.state.startswith("not drawn")
     return 1 if empty else 0
 
 
 def _animate(options: argparse.Namespace) -> int:
     from analysis import film  # Matplotlib: other commands do without it
-    from analysis.stats.curves import median_seed
 
     (env,), (policy,) = options.env, options.policy
     target = options.out or Path("figures") / f"{env}_{policy}.gif".replace("/", "_")
-    with Reader.open(options.db) as reader:
-        selection = select(reader, wanted(options))
-        _say_notes(selection)
+    film.writer_of(target)
+    with _selected(options) as (reader, selection):
         [entry] = selection.entries
         losses = entry.final_losses()
         if options.seed is None and not losses:
@@ -243,16 +240,17 @@ def _animate(options: argparse.Namespace) -> int:
         seed = median_seed(losses) if options.seed is None else options.seed
         story = film.tell(reader, entry, seed, options.frames)
     film.shoot(story, target, options.fps)
-    tell(sys.stdout, f"{target}: seed {seed}, {len(story.steps)} pictures\n")
+    tell(sys.stdout, f"{target}: seed {seed}, {counted(len(story.steps), 'picture')}\n")
     return 0
 
 
-def _table(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+def _table(options: argparse.Namespace) -> int:
     """Print the table of a command."""
     kind, form = options.table(options), options.format
-    table = kind.measure(reader, selection, _plot_options(options))
+    with _selected(options) as (reader, selection):
+        table = kind.measure(reader, selection, _plot_options(options))
     if selection.gaps:
-        tell(sys.stderr, f"{partial_warning(selection)}\n")
+        tell(sys.stderr, f"{partial_warning(selection.gaps)}\n")
     tell(sys.stdout, _text(kind.render(table), table, form), exact=form == "csv")
     return 0
 
@@ -276,7 +274,7 @@ def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
 
 def _add_serve(commands: argparse._SubParsersAction[Parser]) -> None:
     serve = commands.add_parser("serve", help=SERVE_HELP, description=SERVE_HELP)
-    serve.set_defaults(alone=_serve)
+    serve.set_defaults(run=_serve)
     add_database(serve)
     serve.add_argument("--port", type=int, default=PORT, help=f"port, 0: any free one ({PORT})")
     serve.add_argument("--host", default=HOST, help=f"address to listen at ({HOST})")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from analysis.data.matching import AnalysisError
 from analysis.data.samples import simulated_trial
-from analysis.data.selection import Entry
+from analysis.data.selection import Entry, ranges
 from analysis.figures.losses import loss_label
 from analysis.figures.panels import angle_ticks, log_scale, mathematical, styled
 from analysis.stats.curves import DrawnPlane, log_limits
@@ -79,10 +79,10 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
 
     Raises ``AnalysisError`` if it is not finished, has no steps, or runs another way here.
     """
-    config, finished = entry.config, sorted(trial.seed for trial in entry.finished)
+    config, finished = entry.config, [trial.seed for trial in entry.finished]
     name = f"Seed {seed} of {config.env} × {config.policy}"
     if seed not in finished:
-        raise AnalysisError(f"{name} is not finished: choose by --seed one of {finished[:10]}.")
+        raise AnalysisError(f"{name} is not finished: choose by --seed one of {ranges(finished)}.")
     spec = simulated_trial(config, seed)
     states = reader.trajectory(config.config_key, seed).states
     states = states[np.isfinite(states).all(axis=1)]
@@ -101,16 +101,24 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
     return Story(spec, seen.steps, states, loss, truth, np.array(learned))
 
 
-def shoot(story: Story, target: Path, frames_per_second: int) -> None:
-    """Write all frames into a ``.gif`` or an ``.mp4``, whole or not at all."""
+def writer_of(target: Path) -> str:
+    """Return the name of the program that writes a ``.gif`` or an ``.mp4``.
+
+    Raises ``AnalysisError`` for other files, and where the program is not installed.
+    """
     program = {".gif": "pillow", ".mp4": "ffmpeg"}.get(target.suffix, "")
     if not writers.is_available(program):
         raise AnalysisError(
             f"{target} cannot be written, but a .gif can, and an .mp4 where ffmpeg is: choose one."
         )
+    return program
+
+
+def shoot(story: Story, target: Path, frames_per_second: int) -> None:
+    """Write all frames into a file that :func:`writer_of` knows, whole or not at all."""
+    writer = writers[writer_of(target)](fps=frames_per_second)
     with whole(target) as part, styled():
-        film = FuncAnimation(*_stage(story), frames=len(story.steps))
-        film.save(part, writer=writers[program](fps=frames_per_second), dpi=110)
+        FuncAnimation(*_stage(story), frames=len(story.steps)).save(part, writer=writer, dpi=110)
 
 
 def _stage(story: Story) -> tuple[Figure, Callable[[int], tuple[()]]]:

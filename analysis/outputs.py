@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from analysis.data.selection import Selection
+from analysis.data.selection import Gap, Selection
 from analysis.stats.curves import PlotOptions
+from analysis.style import counted
 from analysis.tables.rendering import TABLES
 from dopt import __version__
 from orchestrate.files import make_folder, whole
@@ -133,7 +134,7 @@ def _draw(
         drawing = plot.make(reader, selection, options)
         caption = drawing.caption
         if selection.gaps:
-            warning = partial_warning(selection)
+            warning = partial_warning(selection.gaps)
             caption = f"{warning} {caption}"
             drawing.figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
         write_pictures(drawing.figure, folder, name, plot.title, mark)
@@ -148,7 +149,7 @@ def _tabulate(
     kind = TABLES[name]
     table = kind.measure(reader, selection, options)
     text_table = kind.render(table)
-    warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
+    warning = f"{partial_warning(selection.gaps)}\n\n" if selection.gaps else ""
     write_table(table, folder, name)
     write_text(warning + text_table.markdown(), folder / f"{name}.md")
     comment = f"% {warning.rstrip()}\n" if warning else ""
@@ -156,9 +157,9 @@ def _tabulate(
     return {"title": kind.title, "caption": warning + text_table.note}
 
 
-def partial_warning(selection: Selection) -> str:
+def partial_warning(gaps: Iterable[Gap]) -> str:
     """Return the mark of an output that lacks trials."""
-    return f"PARTIAL: {sum(len(gap.seeds) for gap in selection.gaps)} trials missing."
+    return f"PARTIAL: {counted(sum(len(gap.seeds) for gap in gaps), 'trial')} missing."
 
 
 @functools.cache

@@ -52,7 +52,6 @@ from analysis.tables.variants import (
 )
 from dopt.policies import POLICIES
 from orchestrate.files import make_folder
-from orchestrate.program import path
 from orchestrate.store import Reader
 
 HELP = "compare every policy, model and learner with the reference, on one page"
@@ -116,11 +115,6 @@ EXPLAINED = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that only this command has."""
-    parser.add_argument("--out", type=path("--out"), default="report", help="folder (report/)")
-
-
 def run(options: argparse.Namespace, wanted: Filter) -> int:
     """Write the page, the pictures, the CSV and the provenance; 0."""
     from analysis.figures.panels import styled  # Matplotlib: other commands do without it
@@ -148,7 +142,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         outputs.write_table(controlled, options.out, CONTROL)
     notes = [f"{group.env}: {note}" for group in found for note in group.notes]
     if gaps:
-        notes.insert(0, f"PARTIAL: {sum(len(gap.seeds) for gap in gaps)} trials are missing")
+        notes.insert(0, outputs.partial_warning(gaps))
     text = write_report(
         table,
         notes,

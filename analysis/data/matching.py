@@ -18,15 +18,13 @@ import json
 import math
 import reprlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-from dopt.errors import DoptError, SpecificationError
-from dopt.limits import Limits
+from dopt.errors import DoptError
 from dopt.registry import SOURCE, TARGET
-from dopt.spec.config import difference, flatten
-from dopt.spec.trial import TrialSpec, is_fit
+from dopt.spec.config import difference, flatten, unusual
+from dopt.spec.trial import is_fit
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
 
 
@@ -196,25 +194,24 @@ def _reference(group: Sequence[ConfigRow], reference: str) -> ConfigRow:
         setting = _setting(config)
         return -(len(policies[setting]) < 2), totals[setting], config.n, *nearness(config)
 
-    best = _first(pool, rank)
-    if len({_setting(config) for config in best}) > 1:
-        raise _tie(best)
-    return best[0]
+    return _first(pool, rank, _setting)
 
 
 def _most(configs: Sequence[ConfigRow]) -> ConfigRow:
-    best = _first(configs, lambda one: (one.n, *nearness(one)))
-    if len(best) > 1:
-        raise _tie(best)
-    return best[0]
+    return _first(configs, lambda one: (one.n, *nearness(one)), lambda one: one.config_key)
 
 
 def _first(
-    configs: Sequence[ConfigRow], rank: Callable[[ConfigRow], tuple[int, ...]]
-) -> list[ConfigRow]:
-    """Return the configurations of the highest rank."""
+    configs: Sequence[ConfigRow],
+    rank: Callable[[ConfigRow], tuple[int, ...]],
+    what: Callable[[ConfigRow], Hashable],
+) -> ConfigRow:
+    """Return the configuration of the highest rank; raise AnalysisError if several differ."""
     top = max(map(rank, configs))
-    return [config for config in configs if rank(config) == top]
+    best = [config for config in configs if rank(config) == top]
+    if len(set(map(what, best))) > 1:
+        raise _tie(best)
+    return best[0]
 
 
 def nearness(config: ConfigRow) -> tuple[int, int, int, bool]:
@@ -224,39 +221,12 @@ def nearness(config: ConfigRow) -> tuple[int, int, int, bool]:
     not defaults of what is named, then no task: it changes nothing of the trial. Last come stored
     sample losses.
     """
-    usual, parts = defaults(config), _sections(config)
-    task = parts.pop("task", None) is not None
-    sampled = parts.pop("assess", None) is not None
-    own = flatten(parts) if usual else {}
+    parts = {key: one for key, one in config.config.items() if isinstance(one, Mapping)}
+    task, sampled = parts.pop("task", None), parts.pop("assess", None)
     names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
-    return (
-        -sum(names),
-        -sum(usual.get(path) != value for path, value in own.items()),
-        -task,
-        sampled,
-    )
-
-
-def defaults(config: ConfigRow) -> dict[str, object]:
-    """Return the defaults of what a configuration names, without its task, as dotted paths.
-
-    Of limits, all settings except the name: a configuration without limits is nearer than one with
-    any. Empty if the system or the policy is a user's class, which is not registered here.
-    """
-    names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
-    for key in ("task", "assess"):
-        names.pop(key, None)
-    limits = Limits().to_section() if names.pop("limits", None) else {}
-    limits.pop("name", None)
-    try:
-        usual = TrialSpec.from_mapping(names).to_mapping()
-        return flatten({**usual, "limits": limits})
-    except (SpecificationError, KeyError):  # a plant is more than its name
-        return {}
-
-
-def _sections(config: ConfigRow) -> dict[str, Mapping[str, Any]]:
-    return {key: value for key, value in config.config.items() if isinstance(value, Mapping)}
+    settings = unusual(parts) - {f"{section}.name" for section in USUAL}
+    plant = "plant" in parts.get("env", {})  # which is unusual whatever its settings
+    return -sum(names), -len(settings) - plant, -(task is not None), sampled is not None
 
 
 def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:

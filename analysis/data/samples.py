@@ -21,13 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import (
-    AnalysisError,
-    Filter,
-    accepted,
-    choose,
-    latest_sources,
-)
+from analysis.data.matching import AnalysisError, Filter, accepted, choose, latest_sources
 from analysis.data.selection import Entry, environment_rank, policy_rank
 from dopt.assessment import SAMPLE_LOSS, Plane
 from dopt.evaluation import rates
@@ -37,13 +31,7 @@ from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
 from dopt.types import Array, Integers
-from orchestrate.store import (
-    CONFIG_COLUMNS,
-    ConfigRow,
-    Curves,
-    Reader,
-    default_url,
-)
+from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
 from orchestrate.store.records import stacked
 from orchestrate.store.schema import STEP_VALUES
 

@@ -20,6 +20,7 @@ from analysis.data.matching import (
     setting_value,
     source_notes,
 )
+from analysis.style import counted
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES, TITLES
 from dopt.spec.config import SECTIONS, labels, limits_label, value_label
@@ -49,13 +50,9 @@ class Gap:
     seeds: tuple[int, ...]
     states: str
 
-    def describe_seeds(self) -> str:
-        """Return the seeds as ranges, such as ``0-4, 7``."""
-        return ranges(self.seeds)
-
 
 def ranges(seeds: Iterable[int]) -> str:
-    """Return whole numbers as a short text of ranges."""
+    """Return whole numbers as a short text of ranges, such as ``0-4, 7``."""
     runs: list[list[int]] = []
     for seed in sorted(seeds):
         if runs and seed == runs[-1][1] + 1:
@@ -108,7 +105,7 @@ def omissions(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[st
     kept = {config.config_key for config in chosen}
     left = Counter(config.env for config in accepted if config.config_key not in kept)
     for env, count in sorted(left.items()):
-        yield f"{env}: {count} other stored configurations are not part of this (see --where)"
+        yield f"{env}: {counted(count, 'other stored configuration')} left out (see --where)"
     for env, limits in sorted({(one.env, limits_label(one.config)) for one in chosen}):
         if limits:
             yield f"{env}: these trials have {limits}"
@@ -368,7 +365,7 @@ def unfinished(entries: Iterable[Entry]) -> Iterator[str]:
     for entry in entries:
         missing = len(entry.trials) - len(entry.finished)
         if missing:
-            yield f"{entry.config.env}, {entry.label}: {missing} trials are not finished"
+            yield f"{entry.config.env}, {entry.label}: {counted(missing, 'trial')} not finished"
 
 
 def section_text(entry: Entry, name: str) -> str:

@@ -23,7 +23,7 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from analysis.data.matching import APART
+from analysis.data.matching import APART, USUAL
 from analysis.data.samples import read_sample
 from analysis.data.selection import (
     Entry,
@@ -81,6 +81,10 @@ from dopt.spec.trial import system_of
 from orchestrate.store import Reader
 
 CURVES_HEIGHT = 2.3
+
+LONGEST_LABEL = 26
+"""Letters of a line of the label of losses that are not longer than the axis of a broken panel."""
+
 PLACES = {"loss": "grid", "reachable_loss": "reachable set"}
 """Points at which the error of the model is evaluated, by column of a step."""
 
@@ -124,7 +128,8 @@ def draw_curves(numbers: Curves) -> Figure:
         )
         if index + columns >= len(envs):
             panel[-1].set_xlabel(f"time t [{unit}]")
-        panel[0].set_ylabel(loss_label(column, shown[0].unit, shown[0].is_prequential))
+        label = loss_label(column, shown[0].unit, shown[0].is_prequential)
+        panel[0].set_ylabel(label if len(label) <= LONGEST_LABEL else label.replace(" [", "\n["))
     ordered = sorted(curves, key=lambda curve: policy_rank(curve.policy))
     handles = legend_handles({curve.label: curve.style for curve in ordered}, options)
     legend_below(figure, 4 if columns > 1 else 2, handles=handles)
@@ -261,9 +266,6 @@ def _what(column: str, curves: Sequence[LossCurve]) -> str:
     return f"{found}, or {told}," if True in kinds else found
 
 
-USUAL = "mlp"
-"""Model that goes without saying."""
-
 FEWEST = 2
 """Configurations of an environment from which they are compared."""
 
@@ -331,18 +333,18 @@ def measure_points(reader: Reader, selection: Selection) -> pd.DataFrame:
 
 
 def learner_words(entries: Sequence[Entry]) -> list[str]:
-    """Return the words of the learner of each entry, and of a model that is not the network."""
+    """Return the words of the learner of each entry, and of a model that is not the usual one."""
     learners, models = (section_words(entries, name) for name in ("learner", "model"))
-    several = len({entry.config.model for entry in entries}) > 1
+    beside = {one: f", {words}" for one, words in models.items() if words != USUAL["model"]}
+    beside = beside if len(models) > 1 else {}
     return [
-        learners[section_text(entry, "learner")]
-        + (f", {models[section_text(entry, 'model')]}" if several and model != USUAL else "")
-        for entry, model in ((entry, entry.config.model) for entry in entries)
+        learners[section_text(entry, "learner")] + beside.get(section_text(entry, "model"), "")
+        for entry in entries
     ]
 
 
 def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
-    """Return for each section, as JSON, its name with the settings that differ.
+    """Return words for each section, as JSON: what differs from the defaults, else its name.
 
     They are the words of labels of configurations that differ in this section alone.
     """
@@ -352,9 +354,13 @@ def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
         replace(config, config={**rest, section: config.config[section]})
         for config in first.values()
     ]
-    names = [str(config.config[section]["name"]) for config in first.values()]
-    words = labels_of(alike) if len(alike) > 1 or section == "policy" else names
-    return dict(zip(first, words, strict=True))
+    if section == "policy":
+        return dict(zip(first, labels_of(alike), strict=True))
+    title = policy_title(str(rest["policy"]["name"]))
+    return {
+        text: str(one.config[section]["name"]) if words == title else words
+        for (text, one), words in zip(first.items(), labels_of(alike), strict=True)
+    }
 
 
 def step_us(reader: Reader, entry: Entry) -> float:

@@ -32,13 +32,7 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.stats.curves import (
-    DrawnPlane,
-    average_spectrum,
-    centre,
-    median_seed,
-    standard_error,
-)
+from analysis.stats.curves import DrawnPlane, average_spectrum, centre, median_seed, standard_error
 from analysis.style import (
     BLACK,
     but_diverged,

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.data.matching import AnalysisError, latest
+from analysis.data.matching import AnalysisError, latest, nearness
 from analysis.data.samples import bounded_states
-from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
+from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank, ranges
 from analysis.serve.web import QueryParams, RequestError, ServerState, read_progress, truncated
 from analysis.stats.curves import (
     Axis,
@@ -28,7 +28,7 @@ from analysis.stats.curves import (
     periodogram,
     tabulate_curves,
 )
-from analysis.style import policy_style
+from analysis.style import loss_unit, policy_style
 from dopt.assessment import SAMPLE_LOSS
 from dopt.errors import SpecificationError
 from dopt.explorer.signs import STORED
@@ -162,7 +162,7 @@ def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  #
             for env in _environments(configs)
         ],
         "older": len(stored) - len(configs),
-        "fits": [dict(zip(fits.columns, row, strict=True)) for row in fits],
+        "fits": [row._asdict() for row in fits],
         **_launches(reader),
     }
 
@@ -180,7 +180,10 @@ def _rows(
     absent: Sequence[tuple[str, str]],
     losses: Sequence[Mapping[str, Array]],
 ) -> list[Content]:
-    """Return a row for each width of an environment, with a cell for each policy."""
+    """Return a row for each width of an environment, with a cell for each policy.
+
+    The configuration that is nearest to the defaults is the first of its cell.
+    """
     widths = _widths(configs)
     only = widths[0] if len(widths) == 1 else None
     tiles = [
@@ -197,6 +200,8 @@ def _rows(
         words = labels(own) if len(own) > 1 or is_prequential(own[0]) else [""]
         for (_, tile), label in zip(cell, words, strict=True):
             tile["label"] = label
+        cell.sort(key=lambda one: one[1]["label"])
+        cell.sort(key=lambda one: nearness(one[0]), reverse=True)
     return [
         {
             "width": width,
@@ -301,6 +306,7 @@ def curves(state: ServerState, params: QueryParams) -> Content:
     return {
         "env": found[0].env,
         "is_prequential": found[0].is_prequential,
+        "unit": found[0].unit,
         "statistic": RUNNING if found[0].is_prequential else found[0].statistic.label,
         "band": found[0].statistic.band,
         "x": max((curve.x for curve in found), key=len),
@@ -309,7 +315,7 @@ def curves(state: ServerState, params: QueryParams) -> Content:
         "widths": f", width {widths[0]}" if len(widths) == 1 else "",
         "notes": [one.replace("--where", "the fields Width and Where") for one in selection.notes],
         "missing": [
-            {"policy": gap.policy, "states": gap.states, "seeds": gap.describe_seeds()}
+            {"policy": gap.policy, "states": gap.states, "seeds": ranges(gap.seeds)}
             for gap in selection.gaps
         ],
     }
@@ -354,9 +360,10 @@ def trials(state: ServerState, params: QueryParams) -> Content:
     """Return one page of the list and the number of matches."""
     reader = state.database.reader()
     configs = reader.configs()
+    environments, policies = _environments(configs), _policies(configs)
     given = {
-        "env": params.choice("env", {config.env for config in configs}),
-        "policy": params.choice("policy", {config.policy for config in configs}),
+        "env": params.choice("env", environments),
+        "policy": params.choice("policy", policies),
         "status": params.choice("status", STATUSES),
         "config_key": params.text("config"),
         "width": params.integer("width", low=1),
@@ -375,10 +382,9 @@ def trials(state: ServerState, params: QueryParams) -> Content:
         f"LIMIT {PAGE_ROWS} OFFSET {PAGE_ROWS * (page - 1)}",
         **wanted,
     )
-    policies = _policies(configs)
     return {
         "progress": read_progress(reader),
-        "rows": [dict(zip(found.columns, row, strict=True)) for row in found],
+        "rows": [row._asdict() for row in found],
         "total": total,
         "sort": sort,
         "order": order,
@@ -388,7 +394,7 @@ def trials(state: ServerState, params: QueryParams) -> Content:
         "numbers": NUMBERS,
         "legend": {name: legend_entry(name) for name in policies},
         "options": {
-            "env": _environments(configs),
+            "env": environments,
             "policy": {name: policy_style(name).label for name in policies},
             "width": _widths(configs),
             "status": STATUSES,
@@ -439,6 +445,7 @@ def arrays(state: ServerState, params: QueryParams) -> Content:
     return {
         **{name: [step[name] for step in steps] for name in ("t", *LOSSES)},
         "is_prequential": is_prequential(config),
+        "unit": loss_unit(system) if system else None,
         "fit": _fit(reader, row, config),
         "legend_entry": legend_entry(row["policy"]),
         "dt": row["dt"],
@@ -496,12 +503,11 @@ def _row(reader: Reader, params: QueryParams) -> Content:
             f"choose one of the trials page.",
             404,
         )
-    return dict(zip(found.columns, found[0], strict=True))
+    return dict(found[0]._asdict())
 
 
 def _table(reader: Reader, sql: str, trial_id: int) -> list[Content]:
-    found = reader.rows(sql, trial_id=trial_id)
-    return [dict(zip(found.columns, row, strict=True)) for row in found]
+    return [row._asdict() for row in reader.rows(sql, trial_id=trial_id)]
 
 
 def _system(config: Content) -> System | None:

@@ -9,7 +9,6 @@ the reference policy under the same other settings (:func:`references`).
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -107,13 +106,8 @@ def compare_steps(
     Raises
     ------
     AnalysisError
-        If ε is no positive number, or there is nothing to compare.
+        If there is nothing to compare.
     """
-    if epsilon is not None and not 0 < epsilon < math.inf:
-        raise AnalysisError(
-            f"The loss to reach, --epsilon, is {epsilon:g}, but a positive number is expected: "
-            f"choose one between the losses of figure 1."
-        )
     rows: list[dict[str, object]] = []
     selection = selection.simulated()
     for env in selection.environments:

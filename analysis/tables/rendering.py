@@ -15,11 +15,12 @@ from tabulate import tabulate
 
 from analysis.data.matching import AnalysisError, IncompleteError
 from analysis.data.samples import learned_model, sample_losses, simulated_trial
-from analysis.data.selection import Entry, Gap, Selection
+from analysis.data.selection import Entry, Gap, Selection, ranges
 from analysis.stats.curves import STUDENT_RANGE, PlotOptions
 from analysis.stats.scores import Measure, geometric_mean
 from analysis.style import (
     but_diverged,
+    counted,
     number,
     p_text,
     plus_minus,
@@ -249,11 +250,11 @@ def _reference(table: pd.DataFrame) -> str:
 def incomplete(gaps: Sequence[Gap], wanted: str, options: str) -> IncompleteError:
     """Return the error for trials that are missing; ``options`` narrow the request."""
     missing = sum(len(gap.seeds) for gap in gaps)
-    rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
+    rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, ranges(gap.seeds)] for gap in gaps]
     table = TextTable(["env", "policy", "missing", "state", "seeds"], rows)
     return IncompleteError(
-        f"{table.markdown()}\n\nerror: {missing} trials are missing, {wanted} "
-        f"expected: run the launch again, narrow the request by {options}, "
+        f"{table.markdown()}\n\nerror: {counted(missing, 'trial')} missing, "
+        f"{wanted} expected: run the launch again, narrow the request by {options}, "
         f"or give --allow-partial to go on with what there is."
     )
 

@@ -16,13 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.data.matching import (
-    AnalysisError,
-    Filter,
-    accepted,
-    latest_sources,
-    nearness,
-)
+from analysis.data.matching import AnalysisError, Filter, accepted, latest_sources, nearness
 from analysis.data.samples import coverages, read_curves, sample_losses
 from analysis.data.selection import (
     Entry,
@@ -55,7 +49,7 @@ from analysis.stats.scores import (
     usable,
     without_ratio,
 )
-from analysis.style import but_diverged
+from analysis.style import but_diverged, counted
 from analysis.tables.comparisons import against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
 from dopt.policies import policy_title
@@ -182,7 +176,7 @@ def _of_unequal_seeds(variants: Sequence[Entry]) -> Iterator[str]:
     numbers = Counter(len({trial.seed for trial in one.trials}) for one in variants)
     if len(numbers) > 1:
         counts = ", ".join(
-            f"{n} seeds: {count} variant{'s' * (count > 1)}" for n, count in sorted(numbers.items())
+            f"{n} seeds: {counted(count, 'variant')}" for n, count in sorted(numbers.items())
         )
         yield f"{counts}; a ratio is over the seeds that both variants of it have"
 

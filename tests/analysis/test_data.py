@@ -310,6 +310,13 @@ def config(section: str, **content: object) -> ConfigRow:
     return ConfigRow(**cast(dict[str, Any], {**values, "config": {**stored, section: content}}))
 
 
+def test_a_real_plant_is_farther_from_the_defaults_whatever_its_settings() -> None:
+    env = json.loads(TrialSpec.from_names("pendulum", "random").config_json)["env"]
+    ideal, real = config("env", **env), config("env", **env, plant={"name": "real"})
+    delayed = config("env", **env, plant={"name": "real", "delay": 1})
+    assert nearness(ideal) > nearness(real) > nearness(delayed)
+
+
 @pytest.mark.parametrize("section", ["env", "policy", "model", "learner"])
 @pytest.mark.parametrize("source", [{}, {"source": "0" * 16}])
 def test_a_stranger_s_class_does_not_run(

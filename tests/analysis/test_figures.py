@@ -194,5 +194,8 @@ def test_the_paper_s_grid_has_one_too(reader: Reader) -> None:
     plot = PARETO
     drawing = plot.make(reader, plot.part(select(reader, Filter()), PlotOptions()), PlotOptions())
     assert len(drawing.figure.axes) == 3
-    assert "D-optimal, width 64" in set(drawing.table["label"])
+    points = drawing.table
+    assert "D-optimal, width 64" in set(points["label"])
+    assert not points.duplicated(["env", "policy_label", "learner_label"]).any()
+    assert {"adam_window", "adam_window, width 64"} <= set(points["learner_label"])
     assert "oracle" not in set(drawing.table["policy"])

@@ -92,9 +92,12 @@ def test_an_mp4_is_written_by_ffmpeg(story: Callable[..., Story], tmp_path: Path
     assert b"ftyp" in (tmp_path / "film.mp4").read_bytes()[:32]
 
 
-def test_another_ending_is_refused(story: Callable[..., Story], tmp_path: Path) -> None:
-    with pytest.raises(AnalysisError, match=r"cannot be written, but a \.gif can"):
-        shoot(story(), tmp_path / "film.avi", 10)
+def test_another_ending_is_refused_before_the_trial_runs_again(
+    url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("analysis.film.rerun", lambda *_: pytest.fail("the trial ran again"))
+    assert main(["animate", "pendulum", "oracle", "--db", url, "--out", "film.avi"]) == 2
+    assert "film.avi cannot be written, but a .gif can" in capsys.readouterr().err
 
 
 def test_a_trial_that_diverged_is_shown_as_far_as_it_went(tmp_path: Path) -> None:
@@ -156,9 +159,9 @@ def test_the_command_picks_a_seed_and_a_name(
     assert main(["animate", "quadrotor", "d_optimal", "--db", url, "--frames", "3"]) == 0
     assert capsys.readouterr().out == "figures/quadrotor_d_optimal.gif: seed 1, 3 pictures\n"
     assert main(["animate", "pendulum", "oracle", "--db", url, "--frames", "1"]) == 0
-    assert capsys.readouterr().out == "figures/pendulum_oracle.gif: seed 1, 1 pictures\n"
+    assert capsys.readouterr().out == "figures/pendulum_oracle.gif: seed 1, 1 picture\n"
     assert main(["animate", "pendulum", "d_optimal", "--db", url, "--seed", "9"]) == 2
-    assert "by --seed one of [1]" in capsys.readouterr().err
+    assert "by --seed one of 1." in capsys.readouterr().err
     assert main(["animate", "pendulum", "uniform", "--db", url]) == 2
     assert "no trial of policy 'uniform'" in capsys.readouterr().err
     assert main(["animate", "pendulum", "oracle", "--db", url, "--frames", "0"]) == 2

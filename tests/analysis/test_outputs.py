@@ -234,7 +234,7 @@ def test_missing_trials_are_refused_with_a_table(
     assert main(["figures", "--db", partial, "--out", str(tmp_path)]) == 3
     error = capsys.readouterr().err
     assert "| pendulum | d_optimal | 2         | 2 pending | 1-2     |" in error
-    assert "2 trials are missing" in error
+    assert "2 trials missing" in error
     assert not list(tmp_path.iterdir())
 
 

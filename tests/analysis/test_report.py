@@ -250,10 +250,10 @@ def test_missing_trials_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     fill(url, specs, skipped=specs[-1:])
     words = ["report", "--db", url, "--out", str(tmp_path / "out")]
     assert main(words) == 3
-    assert "1 trials are missing" in capsys.readouterr().err
+    assert "error: 1 trial missing" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main([*words, "--allow-partial"]) == 0
-    assert "PARTIAL: 1 trials are missing" in (tmp_path / "out/README.md").read_text()
+    assert "PARTIAL: 1 trial missing" in (tmp_path / "out/README.md").read_text()
 
 
 def test_variants_may_have_different_numbers_of_seeds(tmp_path: Path) -> None:

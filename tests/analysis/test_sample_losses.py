@@ -145,4 +145,4 @@ def test_a_trial_that_is_assessed_while_it_runs_has_the_same(
     (row,) = pd.read_csv(io.StringIO(output)).to_dict("records")
     assert row["sample_loss"] == pytest.approx(np.mean(expected("d_optimal")[:, 1]))
     assert row["label"] == "D-optimal"
-    assert "1 other stored configurations" in notes
+    assert "1 other stored configuration" in notes

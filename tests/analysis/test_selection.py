@@ -25,7 +25,14 @@ from analysis.data.matching import (
     difference,
     newest,
 )
-from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, select
+from analysis.data.selection import (
+    Entry,
+    Selection,
+    environment_rank,
+    policy_rank,
+    ranges,
+    select,
+)
 from analysis.tables.comparisons import compare_policies, references
 from dopt import registry
 from dopt.policies import POLICIES
@@ -236,7 +243,7 @@ def test_pending_trials_are_a_gap(tmp_path: Path) -> None:
     skipped = [s for s in specs if s.policy.name == "random" and s.seed in (1, 2, 5)]
     (gap,) = selected(tmp_path, (specs, skipped)).gaps
     assert (gap.env, gap.policy, gap.states) == ("pendulum", "random", "3 pending")
-    assert gap.describe_seeds() == "1-2, 5"
+    assert ranges(gap.seeds) == "1-2, 5"
 
 
 def test_seeds_that_only_another_policy_has_are_a_gap(tmp_path: Path) -> None:
@@ -259,9 +266,7 @@ def test_other_configurations_are_noted(tmp_path: Path) -> None:
     selection = selected(tmp_path, (specs, []), ([single], []))
     assert selection.gaps == ()
     assert len(selection.entries) == 2
-    assert selection.notes == (
-        "pendulum: 1 other stored configurations are not part of this (see --where)",
-    )
+    assert selection.notes == ("pendulum: 1 other stored configuration left out (see --where)",)
 
 
 def test_assessments_of_different_versions_do_not_mix(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
 
+from analysis.cli import main
 from analysis.data.matching import AnalysisError, Filter
 from analysis.data.selection import select
 from analysis.stats.curves import (
@@ -273,10 +274,14 @@ def test_an_epsilon_that_nobody_reaches_is_a_tie(reader: Reader) -> None:
     assert "> 60" in hitting_times_table(table).markdown()
 
 
-@pytest.mark.parametrize("epsilon", [0.0, -1.0, INF, math.nan])
-def test_an_epsilon_that_is_no_loss_is_refused(reader: Reader, epsilon: float) -> None:
-    with pytest.raises(AnalysisError, match="a positive number is expected"):
-        compare_steps(reader, select(reader, Filter()), epsilon=epsilon)
+@pytest.mark.parametrize("epsilon", ["0", "-1", "inf", "nan"])
+@pytest.mark.parametrize("command", ["figures", "compare"])
+def test_an_epsilon_that_is_no_loss_is_refused(
+    url: str, capsys: pytest.CaptureFixture[str], command: str, epsilon: str
+) -> None:
+    """Also where no output of the command needs it."""
+    assert main([command, "--db", url, "--epsilon", epsilon]) == 2
+    assert f"--epsilon is '{epsilon}', a number above 0 is expected" in capsys.readouterr().err
 
 
 def test_without_random_inputs_an_epsilon_is_needed(reader: Reader) -> None:

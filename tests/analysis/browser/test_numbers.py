@@ -53,6 +53,16 @@ def test_the_grid_has_the_means_of_the_summary(client: TestClient, reader: Reade
     assert (failed["ended"], failed["n"]) == (3, 4)
 
 
+def test_the_usual_configuration_is_the_first_of_its_cell(
+    visit: Callable[..., TestClient], variants_grid: str
+) -> None:
+    pendulum, _ = visit(variants_grid).get("/api/grid").json()["environments"]
+    (row,) = pendulum["rows"]
+    labels = [one["label"] for one in row["cells"][0]["configurations"]]
+    differing = ("D-optimal", "task control", "γ=3", "adam_replay", "rff")
+    assert [words in label for words, label in zip(differing, labels, strict=True)] == [True] * 5
+
+
 @pytest.mark.parametrize("column", ["loss", "reachable_loss"])
 def test_curves_equal_figure_1(client: TestClient, reader: Reader, column: str) -> None:
     asked = f"env=cartpole&column={column}&x=seconds"
@@ -67,6 +77,7 @@ def test_curves_equal_figure_1(client: TestClient, reader: Reader, column: str) 
             np.testing.assert_array_equal(shown, getattr(one.band, name))
         assert curve["count"] == one.count
     np.testing.assert_array_equal(found["x"], expected[0].x)
+    assert found["unit"] == expected[0].unit == "m/s², rad/s²"
     assert found["missing"][0]["policy"] == "periodic"
     table = pd.read_csv(io.StringIO(client.get(f"/api/curves.csv?{asked}").text))
     pd.testing.assert_frame_equal(table, tabulate_curves(expected), check_dtype=False, rtol=1e-15)
@@ -98,6 +109,7 @@ def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> Non
     arrays = client.get(f"/api/trials/{row.trial_key}/arrays").json()
     losses = reader.curves(config.config_key).values
     assert arrays["loss"] == losses[1].tolist()
+    assert arrays["unit"] == "m/s², rad/s²"
     trajectory = reader.trajectory(config.config_key, row.seed)
     assert arrays["inputs"][0]["values"] == trajectory.inputs[:, 0].tolist()
     frequency, density = (np.array(arrays["spectrum"][key]) for key in ("frequency", "density"))
@@ -339,6 +351,7 @@ def test_filters_narrow_the_list(client: TestClient) -> None:
     [
         ("sort=loss", "did you mean 'best_loss'?"),
         ("env=pendulun", "did you mean 'pendulum'?"),
+        ("policy=x", "choose one of d_optimal, oracle, uniform, periodic, random."),
         ("width=many", "a whole number of 1"),
         ("page=0", "a whole number of 1"),
         ("status=%00", "zero character"),

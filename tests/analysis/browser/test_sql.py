@@ -369,15 +369,11 @@ def test_every_answer_carries_the_headers(guarded: TestClient) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "link.png",
-        ".hidden.png",
-        "notes.html",
-        "sub.png",
         "nothing.png",
         "..%2Fsecret.txt",
         "%2e%2e%2fsecret.txt",
         "..\\secret.txt",
-        "figure1.png%00.txt",
+        "icon.svg%00.txt",
         "%2Fetc%2Fpasswd",
     ],
 )

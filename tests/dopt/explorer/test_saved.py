@@ -308,9 +308,7 @@ def test_beside_a_trial_of_the_same_system_it_is_another_configuration(sqlite_ur
     with Reader.open(sqlite_url) as reader:
         selection = select(reader, Filter())
     assert [entry.config.config_key for entry in selection.entries] == [spec.config_key]
-    assert selection.notes == (
-        "pendulum: 1 other stored configurations are not part of this (see --where)",
-    )
+    assert selection.notes == ("pendulum: 1 other stored configuration left out (see --where)",)
     assert not examine(sqlite_url)
 
 

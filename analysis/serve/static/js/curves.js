@@ -74,13 +74,13 @@ function show() {
   const { is_prequential: prequential, curves } = answer;
   const zoomed = chart?.zoomed ? { ...chart.scales.x } : null;
   const banded = value("style") === "band" && !prequential;
-  const where = value("column") === "loss" ? "L² error, evaluation grid" : "L² error, reachable set";
+  const where = value("column") === "loss" ? "RMS error, evaluation grid" : "RMS error, reachable set";
   const lines = curves.map((curve) => ({ ...curve, hidden: hidden.has(curve.policy), ...(banded ? {} : { low: null, high: null }) }));
   chart = draw(place, {
     x: answer.x,
     lines,
     log: [false, true],
-    label: [`time t [${value("x") === "seconds" ? "s" : "steps"}]`, prequential ? "prequential loss" : where],
+    label: [`time t [${value("x") === "seconds" ? "s" : "steps"}]`, `${prequential ? "prequential error" : where} [${answer.unit}]`],
     range: limits,
     height: 430,
     title: (index) => `t = ${time(index)}`,
@@ -97,7 +97,7 @@ function show() {
   part("lead").textContent = prequential ? PREQUENTIAL : LEAD;
   part("band").textContent = prequential ? `Points: each step. Lines: ${answer.statistic}.` : banded ? `Interval: ${answer.band}.` : "";
   for (const name of ["column", "style"]) form.elements.namedItem(name).closest("label").hidden = prequential;
-  const gaps = answer.missing.map((gap) => `${gap.policy}: ${gap.states} (seeds ${gap.seeds})`);
+  const gaps = answer.missing.map((gap) => `${gap.policy}: ${gap.states} (seed${/^\d+$/.test(gap.seeds) ? "" : "s"} ${gap.seeds})`);
   const missing = gaps.length ? [element("p", "warning", `Not all trials have ended: ${gaps.join("; ")}.`)] : [];
   part("missing").replaceChildren(...missing, ...answer.notes.map((text) => element("p", "note", `${text}.`)));
   fill(lines);

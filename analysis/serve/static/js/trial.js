@@ -16,7 +16,7 @@ function drawLoss(found) {
   const own = found.is_prequential ? "prequential loss" : found.fit && "error";
   const grid = line(found, own || "evaluation grid", found.loss);
   const reachable = line(found, "reachable set", found.reachable_loss, 0, 1, { dash: [5, 4] });
-  const label = ["time t [steps]", own || "L² error"];
+  const label = ["time t [steps]", (own || "RMS error") + (found.unit && !found.fit ? ` [${found.unit}]` : "")];
   const range = () => logRange([...found.loss, ...found.reachable_loss]);
   const lines = own ? [grid] : [grid, reachable];
   draw(part("loss"), { x: found.t, lines, label, log: [false, true], range, title: (i) => `t = ${found.t[i]}` });
