@@ -162,7 +162,7 @@ def _bootstrap(values: Array, statistic: Statistic) -> tuple[Array, Array]:
     """Return the percentile interval of trials (n, T), each end (T,).
 
     A draw takes the same trials at every step. Median and IQM are means of the middle of a sorted
-    sample. What is sorted are ranks of 32 bits, which takes two thirds of the time of sorting the values.
+    sample. Ranks of 32 bits are sorted, in two thirds of the time that the values would take.
     """
     n = len(values)
     first, last = n // 4, n - n // 4
