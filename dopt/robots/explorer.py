@@ -319,8 +319,7 @@ class RobotExplorer:
         most, target = self.acceleration, np.clip(self._target, -self._fastest, self._fastest)
         a = np.clip((target - self._v) / self.dt, -most, most)
         v = self._v + a * self.dt
-        rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
-        blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
+        blocked = self._outward(self._q + v * self.dt, v)
         brake = np.clip(-self._v / self.dt, -most, most)
         a = np.where(blocked, brake, a)
         v = self._v + a * self.dt
@@ -331,6 +330,13 @@ class RobotExplorer:
         reached = np.abs(self._v - target) < 1e-9
         ended = blocked & ~self._wary
         self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
+
+    def _outward(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
+        """Return which joints, (n,), braking from now, come to rest beyond where they may go."""
+        rest = q + v * np.abs(v) / (2.0 * self.acceleration)
+        above, below = (rest > self._high) & (v > 0.0), (rest < self._low) & (v < 0.0)
+        result: npt.NDArray[np.bool_] = above | below
+        return result
 
     def _pace(self) -> None:
         """Leave room between references and limits of velocity for rates that run ahead."""
@@ -414,9 +420,8 @@ class RobotExplorer:
         chosen = self._maximize(Q, v, self._gamma, self._tie)
         a = idle + inverse @ (chosen * limits.torque)
         after = tracker.v + self.dt * a
-        rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
-        outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
-        guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
+        fast = np.abs(after) > GUARDED * limits.velocity
+        guarded = fast | self._outward(tracker.q, after)
         if guarded.any():
             brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
             a = np.where(guarded, brake, a)
