@@ -514,7 +514,8 @@ class RobotExplorer:
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)
-        self._say(f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3)} kg m")
+        moment = found[1:].round(3)
+        self._say(f"the last body carries {mass:+.3f} kg more, whose first moment is {moment} kg m")
         self._recent.clear()
         self._payload, self._since = None, 0
 
@@ -539,11 +540,13 @@ class RobotExplorer:
         """
         learner, unit, velocity = self.learner, self.limits.torque, self.limits.velocity
         values, half = (part * unit[:, None] for part in learner.intervals())
+        with np.errstate(divide="ignore"):  # of a joint that did not move
+            widths = half[:, :-2].max(axis=1) / (learner.sizes() * unit)
         joints = {
             name: {
                 "coulomb": (values[j, -2], half[j, -2]),
                 "viscous": (values[j, -1] / velocity[j], half[j, -1] / velocity[j]),
-                "relative_width": half[j, :-2].max() / (learner.sizes()[j] * unit[j]),
+                "relative_width": widths[j],
                 "noise": learner.noise[j] * unit[j],
             }
             for j, name in enumerate(self.body.joints)
