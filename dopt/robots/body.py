@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia="1e-6"/></mujoco>'
 """Settings with which an URDF is read whose inertias no rigid body can have."""
 
+PACKAGE = "package://"
+"""Beginning of the files of a ROS package."""
+
 DEEPER, ANYWHERE = 0.005, 200
 """Metres by which bodies that touch at home may come deeper, and random positions looked at."""
 
@@ -109,6 +112,8 @@ class Body:
     @classmethod
     def load(cls, file: str | Path) -> Body:
         """Read a file, .xml (MJCF) or .urdf; meshes that are not there are left out.
+
+        Those of a ROS package, package://NAME/FILE, are looked for in the folders above the file.
 
         Raises
         ------
@@ -567,6 +572,8 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(source))
+    for mesh in spec.meshes:
+        mesh.file = _located(source, mesh.file)
     try:
         return spec, spec.compile(), []
     except ValueError as error:
@@ -580,3 +587,17 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
     return spec, spec.compile(), lost
+
+
+def _located(source: Path, file: str) -> str:
+    """Return where a mesh package://NAME/FILE is: NAME is a folder above the robot's or beside it.
+
+    The package may have another name there. Other files are returned as they are.
+    """
+    if not file.startswith(PACKAGE):
+        return file
+    _, *inside = parts = file.removeprefix(PACKAGE).split("/")
+    places = (
+        folder.joinpath(*path) for folder in source.resolve().parents for path in (parts, inside)
+    )
+    return next((str(place) for place in places if place.is_file()), file)
