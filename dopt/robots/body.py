@@ -1,8 +1,7 @@
 """Rigid body of a robot from MJCF or URDF: its joints, its torques, and how they depend on it.
 
 Motions are arrays over time: positions, velocities and accelerations of the n driven joints, each
-(T, n), in rad or m, and torques (T, n), in N m or N. Spatial vectors are angular parts before
-linear ones: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008).
+(T, n), in rad or m, and torques (T, n), in N m or N.
 """
 
 from __future__ import annotations
@@ -27,6 +26,9 @@ if TYPE_CHECKING:
 
 BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia="1e-6"/></mujoco>'
 """Settings with which an URDF is read whose inertias no rigid body can have."""
+
+PACKAGE = "package://"
+"""Beginning of the files of a ROS package."""
 
 DEEPER, ANYWHERE = 0.005, 200
 """Metres by which bodies that touch at home may come deeper, and random positions looked at."""
@@ -111,6 +113,8 @@ class Body:
     def load(cls, file: str | Path) -> Body:
         """Read a file, .xml (MJCF) or .urdf; meshes that are not there are left out.
 
+        Those of a ROS package, package://NAME/FILE, are looked for in the folders above the file.
+
         Raises
         ------
         SpecificationError
@@ -159,13 +163,7 @@ class Body:
     @property
     def inertial(self) -> Array:
         """Inertial parameters of the moved bodies, (10 · bodies,)."""
-        rows, model = [], self.model
-        for b in self.moved:
-            m, c, axes = model.body_mass[b], model.body_ipos[b], rotation(model.body_iquat[b])
-            about_com = axes @ np.diag(model.body_inertia[b]) @ axes.T
-            about = about_com + m * (c @ c * np.eye(3) - np.outer(c, c))
-            rows.append(inertial_row(m, m * c, about))
-        return np.concatenate(rows)
+        return inertial(self.model, self.moved)
 
     @property
     def home(self) -> Array:
@@ -192,11 +190,18 @@ class Body:
     def regressor(self, motion: Motion) -> Array:
         """Return how torques depend on the inertial parameters, (T, n, 10 · bodies).
 
-        Torques of a rigid body are linear in them: C. G. Atkeson et al., IJRR 5, 3 (1986).
+        A body of pose H and pseudo-inertia J takes the torques tr(∂H/∂q J (Ḧ - G)ᵀ), with gravity
+        G, all (4, 4): J. J. Uicker, J. Applied Mechanics 34, 2 (1967); P. M. Wensing, S. Kim and
+        J.-J. E. Slotine, IEEE Robotics and Automation Letters 3, 1 (2018).
         """
-        frames = self._frames(motion)
-        blocks = [self._block(frames, b) for b in self.moved]
-        return np.concatenate(blocks, axis=2)
+        result = np.zeros((len(motion.positions), self.n, len(self.moved), INERTIAL))
+        frames, gravity = self._frames(motion), np.zeros((4, 4))
+        for i, b in enumerate(self.moved):
+            _, _, bent, slopes = frames[b]
+            gravity[:3, 3] = self.model.opt.gravity * (1.0 - self.model.body_gravcomp[b])
+            pairs = np.swapaxes(slopes, 2, 3) @ (bent - gravity)[:, None]
+            result[:, self._paths[b], i] = pairs.reshape(*pairs.shape[:2], 16) @ PSEUDO
+        return result.reshape(*result.shape[:2], -1)
 
     def torques(self, motion: Motion, regressor: Array | None = None) -> Array:
         """Return the torques that move the body, without friction, (T, n).
@@ -216,66 +221,34 @@ class Body:
     def _known(self) -> KnownBody:
         return KnownBody(self)
 
-    def _frames(self, motion: Motion) -> dict[int, tuple[Array, ...]]:
-        """Return rotation, origin, velocity, acceleration and Jacobian of each body, by time.
+    def _frames(self, motion: Motion) -> list[tuple[Array, ...]]:
+        """Return H, Ḣ, Ḧ, each (T, 4, 4), and ∂H/∂q by the joints that move it, of each body.
 
-        Spatial vectors are about the origin of the world; the acceleration lacks gravity.
+        H turns homogeneous coordinates in the body into those in the world.
         """
-        model, n, t = self.model, self.n, len(motion.positions)
-        zero = np.zeros((t, 6))
-        frames: dict[int, tuple[Array, ...]] = {}
-        frames[0] = (np.tile(np.eye(3), (t, 1, 1)), zero[:, :3], zero, zero, np.zeros((t, 6, n)))
-        own = {j: k for k, j in enumerate(self._ids)}
+        model, t = self.model, len(motion.positions)
+        still = np.zeros((t, 4, 4))
+        frames: list[tuple[Array, ...]] = [
+            (np.tile(np.eye(4), (t, 1, 1)), still, still, still[:, None][:, :0])
+        ]
         for b in range(1, model.nbody):
-            turn, origin, velocity, acceleration, jacobian = frames[int(model.body_parentid[b])]
-            origin = origin + turn @ model.body_pos[b]
-            turn = turn @ rotation(model.body_quat[b])
-            first = int(model.body_jntadr[b])
-            for j in range(first, first + int(model.body_jntnum[b])):
-                if j not in own:
-                    continue
-                k = own[j]
-                axis = turn @ model.jnt_axis[j]
-                anchor = origin + turn @ model.jnt_pos[j]
-                moved = motion.positions[:, k] - model.qpos0[self.addresses[k]]
-                if model.jnt_type[j] == HINGE:
-                    column = np.concatenate([axis, _cross(anchor, axis)], axis=1)
-                    turns = Rotation.from_rotvec(np.outer(moved, model.jnt_axis[j]))
-                    turn = turn @ turns.as_matrix()
-                    origin = anchor - turn @ model.jnt_pos[j]
-                else:
-                    column = np.concatenate([np.zeros_like(axis), axis], axis=1)
-                    origin = origin + axis * moved[:, None]
-                rate = motion.velocities[:, k, None]
-                acceleration = (
-                    acceleration
-                    + column * motion.accelerations[:, k, None]
-                    + _crossed(velocity, column) * rate
-                )
-                velocity = velocity + column * rate
-                jacobian = jacobian.copy()
-                jacobian[:, :, k] = column
-            frames[b] = turn, origin, velocity, acceleration, jacobian
+            fixed = np.eye(4)
+            fixed[:3, :3], fixed[:3, 3] = rotation(model.body_quat[b]), model.body_pos[b]
+            pose, rate, bent, slopes = (part @ fixed for part in frames[model.body_parentid[b]])
+            for k in self._paths[b][slopes.shape[1] :]:
+                j = self._ids[k]
+                twist, hinge = _twist(model, j), model.jnt_type[j] == HINGE
+                x = motion.positions[:, k, None, None] - model.qpos0[self.addresses[k]]
+                v, a = (one[:, k, None, None] for one in (motion.velocities, motion.accelerations))
+                around = np.sin(x) * twist + (1.0 - np.cos(x)) * (twist @ twist)
+                moved = np.eye(4) + (around if hinge else x * twist)
+                pose, rate, bent = (part @ moved for part in (pose, rate, bent))
+                slope = pose @ twist
+                bent = bent + 2.0 * v * (rate @ twist) + a * slope + v**2 * (slope @ twist)
+                rate = rate + v * slope
+                slopes = np.concatenate([slopes @ moved[:, None], slope[:, None]], axis=1)
+            frames.append((pose, rate, bent, slopes))
         return frames
-
-    def _block(self, frames: dict[int, tuple[Array, ...]], b: int) -> Array:
-        """Return the regressor of one body, (T, n, 10)."""
-        turn, origin, velocity, acceleration, jacobian = frames[b]
-        back = np.swapaxes(turn, 1, 2)
-        joints = self._paths[b]
-        spin = np.squeeze(back @ velocity[:, :3, None], 2)
-        speed = np.squeeze(back @ _shifted(velocity, origin)[..., None], 2)
-        turned = np.squeeze(back @ acceleration[:, :3, None], 2)
-        gravity = self.model.opt.gravity * (1.0 - self.model.body_gravcomp[b])
-        rising = np.squeeze(back @ (_shifted(acceleration, origin) - gravity)[..., None], 2)
-        forces = _forces(spin, speed, turned, rising)
-        # Columns of the Jacobian in the body's frame.
-        angular = back @ jacobian[:, :3][:, :, joints]
-        lever = jacobian[:, 3:][:, :, joints] - _skew(origin) @ jacobian[:, :3][:, :, joints]
-        columns = np.concatenate([angular, back @ lever], axis=1)
-        block = np.zeros((len(turn), self.n, INERTIAL))
-        block[:, joints] = np.swapaxes(columns, 1, 2) @ forces
-        return block
 
     def collisions(self, positions: Array) -> list[tuple[int, str, str]]:
         """Return where bodies touch that do not at home, or deeper: row, and the two bodies' names.
@@ -459,60 +432,44 @@ HINGE, SLIDE = 3, 2
 """Types of joints of MuJoCo."""
 
 
-def inertial_row(mass: float, first: Array, about_origin: Array) -> Array:
-    """Return inertial parameters, (10,), from m, m c, (3,), and the inertia, (3, 3)."""
-    i = about_origin
-    parts = [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]
-    return np.array([mass, *first, *parts])
+def inertial(model: mujoco.MjModel, bodies: Sequence[int]) -> Array:
+    """Return the inertial parameters of some bodies of a model, (10 · bodies,)."""
+    rows = []
+    for b in bodies:
+        m, c, axes = model.body_mass[b], model.body_ipos[b], rotation(model.body_iquat[b])
+        about_com = axes @ np.diag(model.body_inertia[b]) @ axes.T
+        about = about_com + m * (c @ c * np.eye(3) - np.outer(c, c))
+        rows.append([m, *(m * c), *np.diag(about), *about[np.triu_indices(3, 1)]])
+    return np.concatenate(rows)
 
 
-def _forces(spin: Array, speed: Array, turned: Array, rising: Array) -> Array:
-    """Return the spatial forces of unit inertial parameters, (T, 6, 10), in the body's frame."""
-    result = np.zeros((len(spin), 6, INERTIAL))
-    # Acceleration of the body's origin as a point: the spatial one plus ω × v.
-    point = rising + _cross(spin, speed)
-    result[:, 3:, 0] = point
-    twist, whirl = _skew(turned), _skew(spin)
-    result[:, 3:, 1:4] = twist + whirl @ whirl
-    result[:, :3, 1:4] = -_skew(point)
-    result[:, :3, 4:] = _six(turned) + whirl @ _six(spin)
+def _pseudo_inertias() -> Array:
+    """Return the entries of a pseudo-inertia by the inertial parameters, (16, 10).
+
+    It holds the second moments tr(I)/2 - I, the first moments m c, and the mass.
+    """
+    result = np.zeros((4, 4, INERTIAL))
+    result[3, 3, 0] = 1.0
+    for i in range(3):
+        result[i, 3, 1 + i] = result[3, i, 1 + i] = 1.0
+        result[i, i, 4:7] = 0.5 - np.eye(3)[i]
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)), start=7):
+        result[i, j, k] = result[j, i, k] = -1.0
+    return result.reshape(16, INERTIAL)
+
+
+PSEUDO = _pseudo_inertias()
+"""Entries of a pseudo-inertia, (16, 10), by :data:`INERTIAL` parameters."""
+
+
+def _twist(model: mujoco.MjModel, j: int) -> Array:
+    """Return the matrix B of a joint with ∂H/∂q = H B, (4, 4)."""
+    axis, result = model.jnt_axis[j], np.zeros((4, 4))
+    if model.jnt_type[j] == HINGE:
+        result[:3, :3] = np.cross(np.eye(3), axis)
+        axis = np.cross(model.jnt_pos[j], axis)
+    result[:3, 3] = axis
     return result
-
-
-def _six(vectors: Array) -> Array:
-    """Return the matrices that make I w of (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), (T, 3, 6)."""
-    result = np.zeros((len(vectors), 3, 6))
-    x, y, z = vectors.T
-    result[:, 0, 0], result[:, 0, 3], result[:, 0, 4] = x, y, z
-    result[:, 1, 1], result[:, 1, 3], result[:, 1, 5] = y, x, z
-    result[:, 2, 2], result[:, 2, 4], result[:, 2, 5] = z, x, y
-    return result
-
-
-def _skew(vectors: Array) -> Array:
-    """Return the matrices of cross products with vectors, (T, 3, 3)."""
-    result = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -z, y, -x
-    result[:, 1, 0], result[:, 2, 0], result[:, 2, 1] = z, -y, x
-    return result
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return cross products, (T, 3), in a third of the time of ``numpy.cross``."""
-    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
-
-
-def _shifted(vector: Array, origin: Array) -> Array:
-    """Return the linear part of spatial motions at other origins, (T, 3)."""
-    return vector[:, 3:] + _cross(vector[:, :3], origin)
-
-
-def _crossed(velocity: Array, column: Array) -> Array:
-    """Return the rate of a motion that moves with a velocity, (T, 6)."""
-    spin, speed = velocity[:, :3], velocity[:, 3:]
-    linear = _cross(speed, column[:, :3]) + _cross(spin, column[:, 3:])
-    return np.concatenate([_cross(spin, column[:, :3]), linear], axis=1)
 
 
 def rotation(quaternion: Array) -> Array:
@@ -615,6 +572,8 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(source))
+    for mesh in spec.meshes:
+        mesh.file = _located(source, mesh.file)
     try:
         return spec, spec.compile(), []
     except ValueError as error:
@@ -628,3 +587,17 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
     return spec, spec.compile(), lost
+
+
+def _located(source: Path, file: str) -> str:
+    """Return where a mesh package://NAME/FILE is: NAME is a folder above the robot's or beside it.
+
+    The package may have another name there. Other files are returned as they are.
+    """
+    if not file.startswith(PACKAGE):
+        return file
+    _, *inside = parts = file.removeprefix(PACKAGE).split("/")
+    places = (
+        folder.joinpath(*path) for folder in source.resolve().parents for path in (parts, inside)
+    )
+    return next((str(place) for place in places if place.is_file()), file)

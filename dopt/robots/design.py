@@ -84,8 +84,6 @@ class Candidate:
         Standard errors of the requested parameters, relative.
     broken : float
         By how much it breaks the limits of torque or lets bodies touch; 0 if it does neither.
-    score : float
-        Mean logarithm of the relative errors, by D_s, and the penalties: lower is better.
     share : float
         Share of the attainable information about them, for each of them; 0 until it is known.
     """
@@ -96,7 +94,6 @@ class Candidate:
     determinant: float
     errors: Array
     broken: float
-    score: float
     share: float = 0.0
 
     @property
@@ -176,10 +173,13 @@ class Problem:
         """Return the relative standard errors of the requested parameters, (p,)."""
         return relative_errors(information)[: self.count]
 
-    def score(self, determinant: float, errors: Array, broken: float) -> float:
-        """Return the criterion of a :class:`Candidate`: lower is better."""
-        worst = math.log(float(np.max(errors / self.reference)) / ABOVE)
-        return -0.5 * determinant / self.count + FLOOR * max(worst, 0.0) + 10.0 * broken
+    def score(self, one: Candidate) -> float:
+        """Return the mean logarithm of the relative errors, by D_s, and the penalties.
+
+        Lower is better.
+        """
+        worst = math.log(float(np.max(one.errors / self.reference)) / ABOVE)
+        return -0.5 * one.determinant / self.count + FLOOR * max(worst, 0.0) + 10.0 * one.broken
 
     def strains(self, motion: Motion, rigid: Array | None = None) -> Array:
         """Return the largest shares of the limits of torque, friction included, (n,)."""
@@ -190,7 +190,7 @@ class Problem:
         return result
 
     def candidate(self, family: Family, numbers: Array) -> Candidate:
-        """Return a motion with its score; its share is not known yet.
+        """Return a motion with what it tells; its share is not known yet.
 
         It reaches as far as the torques allow, and has a penalty where bodies touch.
         """
@@ -208,8 +208,8 @@ class Problem:
         broken = max(strain - ROOM, 0.0)
         broken += 0.5 + len(touching) / len(looked) if touching else 0.0
         information = self.tangent.information(motion, self.rate, rigid)
-        found = self.determinant(information), self.errors(information), broken
-        return Candidate(family, numbers, reach, *found, self.score(*found))
+        told = self.determinant(information), self.errors(information)
+        return Candidate(family, numbers, reach, *told, broken)
 
     def obstacle(self, one: Candidate) -> str:
         """Return which torque is too large or which bodies touch at finer steps; "" if none do."""
@@ -281,9 +281,13 @@ class Design:
         effort = whole("effort", effort, 1, 10**7)
         rng = np.random.default_rng(seed)
         drawn = list(map(problem.checked, _drawn(problem, rng, progress)))
-        begun = min(drawn, key=_order)
+
+        def order(one: Candidate) -> tuple[bool, float]:
+            return not one.free, problem.score(one)
+
+        begun = min(drawn, key=order)
         last = problem.checked(improved(problem, begun, effort, progress))
-        found = sorted([*drawn, last], key=_order)
+        found = sorted([*drawn, last], key=order)
         if not found[0].free:
             raise SpecificationError(
                 f"no motion was found within the limits of torque and without collisions (in the "
@@ -300,10 +304,6 @@ class Design:
         return cls(problem, tuple(shared), problem.reference, gap / identified)
 
 
-def _order(one: Candidate) -> tuple[bool, float]:
-    return not one.free, one.score
-
-
 def _drawn(
     problem: Problem, rng: np.random.Generator, progress: Callable[[str], object]
 ) -> Iterator[Candidate]:
@@ -316,7 +316,7 @@ def _drawn(
     series = [Fourier(limits, seconds, period) for period in [*periods, seconds]]
     for family in (*series, Ladder(limits, seconds)):
         drawn = (problem.candidate(family, rng.standard_normal(family.size)) for _ in range(DRAWN))
-        best = min(drawn, key=lambda one: one.score)
+        best = min(drawn, key=problem.score)
         progress(f"{family.name}, best of {DRAWN}: {_said(best)}")
         yield best
 
@@ -324,14 +324,9 @@ def _drawn(
 def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
     """Return the best of some random multisines, whose median errors become the reference."""
     family = Multisine(problem.limits, problem.seconds)
-    problem.reference = np.ones(problem.count)
     drawn = [problem.candidate(family, rng.standard_normal(family.size)) for _ in range(REFERENCES)]
     problem.reference = np.median([one.errors for one in drawn], axis=0)
-    found = (
-        dataclasses.replace(one, score=problem.score(one.determinant, one.errors, one.broken))
-        for one in drawn
-    )
-    return min(found, key=lambda one: one.score)
+    return min(drawn, key=problem.score)
 
 
 def _said(one: Candidate) -> str:
@@ -360,7 +355,7 @@ def improved(
             parts = zip(basis, gradient(problem, best.motion(problem.step)), strict=True)
             slopes = np.sum([of.T @ by for of, by in parts], axis=0)
         one = problem.candidate(spline, spline.ascent(points, slopes, radius))
-        if one.score < best.score and not problem.obstacle(one):
+        if problem.score(one) < problem.score(best) and not problem.obstacle(one):
             best, slopes, radius = one, None, min(1.5 * radius, WIDEST)
         elif (radius := 0.4 * radius) < NARROWEST:
             break

@@ -319,8 +319,7 @@ class RobotExplorer:
         most, target = self.acceleration, np.clip(self._target, -self._fastest, self._fastest)
         a = np.clip((target - self._v) / self.dt, -most, most)
         v = self._v + a * self.dt
-        rest = self._q + v * self.dt + v * np.abs(v) / (2.0 * most)
-        blocked = ((rest > self._high) & (v > 0.0)) | ((rest < self._low) & (v < 0.0))
+        blocked = self._outward(self._q + v * self.dt, v)
         brake = np.clip(-self._v / self.dt, -most, most)
         a = np.where(blocked, brake, a)
         v = self._v + a * self.dt
@@ -331,6 +330,13 @@ class RobotExplorer:
         reached = np.abs(self._v - target) < 1e-9
         ended = blocked & ~self._wary
         self._hold = np.where(ended, 0.0, self._hold - self.dt * reached)
+
+    def _outward(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
+        """Return which joints, (n,), braking from now, come to rest beyond where they may go."""
+        rest = q + v * np.abs(v) / (2.0 * self.acceleration)
+        above, below = (rest > self._high) & (v > 0.0), (rest < self._low) & (v < 0.0)
+        result: npt.NDArray[np.bool_] = above | below
+        return result
 
     def _pace(self) -> None:
         """Leave room between references and limits of velocity for rates that run ahead."""
@@ -414,9 +420,8 @@ class RobotExplorer:
         chosen = self._maximize(Q, v, self._gamma, self._tie)
         a = idle + inverse @ (chosen * limits.torque)
         after = tracker.v + self.dt * a
-        rest = tracker.q + after * np.abs(after) / (2.0 * self.acceleration)
-        outward = ((rest > self._high) & (after > 0)) | ((rest < self._low) & (after < 0))
-        guarded = outward | (np.abs(after) > GUARDED * limits.velocity)
+        fast = np.abs(after) > GUARDED * limits.velocity
+        guarded = fast | self._outward(tracker.q, after)
         if guarded.any():
             brake = np.clip(-tracker.v / self.dt, -self.acceleration, self.acceleration)
             a = np.where(guarded, brake, a)
@@ -509,7 +514,8 @@ class RobotExplorer:
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)
-        self._say(f"the last body carries {mass:+.3f} kg more, at {found[1:].round(3)} kg m")
+        moment = found[1:].round(3)
+        self._say(f"the last body carries {mass:+.3f} kg more, whose first moment is {moment} kg m")
         self._recent.clear()
         self._payload, self._since = None, 0
 
@@ -534,6 +540,8 @@ class RobotExplorer:
         """
         learner, unit, velocity = self.learner, self.limits.torque, self.limits.velocity
         values, half = (part * unit[:, None] for part in learner.intervals())
+        with np.errstate(divide="ignore"):  # of a joint that did not move
+            widths = half[:, :-2].max(axis=1) / (learner.sizes() * unit)
         joints: dict[str, dict[str, Any]] = {
             name: {
                 "coulomb": (float(values[j, -2]), float(half[j, -2])),
@@ -541,7 +549,7 @@ class RobotExplorer:
                     float(values[j, -1] / velocity[j]),
                     float(half[j, -1] / velocity[j]),
                 ),
-                "relative_width": float(half[j, :-2].max() / (learner.sizes()[j] * unit[j])),
+                "relative_width": float(widths[j]),
                 "noise": float(learner.noise[j] * unit[j]),
             }
             for j, name in enumerate(self.body.joints)

@@ -276,12 +276,22 @@ class FrictionLearner:
 
     def rows(self, speeds: Array) -> Array:
         """Return the gradients of the curve at speeds, and of the two constants, (n, k + 2, p)."""
-        x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
-        return _with_constants(self.model.jacobian(self.mean[:, : self.p], x))
+        return self._of(self.model.jacobian, speeds)
 
     def _values(self, speeds: Array) -> Array:
+        return self._of(self.model.torques, speeds)
+
+    def _of(self, function: Callable[[Array, Array], Array], speeds: Array) -> Array:
+        """Return a function of the curve at speeds, and of the two constants, (n, k + 2, ...).
+
+        Coulomb and viscous friction are the line through the friction at half of the velocity limit
+        and at it: Stribeck friction is over there.
+        """
         x = np.tile(np.concatenate([speeds, [0.5, 1.0]]), (self.n, 1))
-        return _with_constants(self.model.torques(self.mean[:, : self.p], x))
+        columns = function(self.mean[:, : self.p], x)
+        half, full = columns[:, -2].copy(), columns[:, -1].copy()
+        columns[:, -2], columns[:, -1] = 2.0 * half - full, 2.0 * (full - half)
+        return columns
 
     def deviations(self, speeds: Array = SPEEDS) -> Array:
         """Return standard errors as parts of the torque limit, (n, k + 2), as :meth:`intervals`."""
@@ -328,13 +338,3 @@ class FrictionLearner:
             expected = np.exp(np.interp(speeds, np.log(SPEEDS), known))
         half = half_widths(errors, expected, self.boundary)
         return values * unit, (values - half) * unit, (values + half) * unit
-
-
-def _with_constants(columns: Array) -> Array:
-    """Replace the last two columns, at half of the velocity limit and at it, by two constants.
-
-    Coulomb and viscous friction are the line through them: Stribeck friction is over there.
-    """
-    half, full = columns[:, -2].copy(), columns[:, -1].copy()
-    columns[:, -2], columns[:, -1] = 2.0 * half - full, 2.0 * (full - half)
-    return columns

@@ -75,23 +75,18 @@ class Limits:
         """
         own = _own(body)
         given = {} if file is None else _given(body, Path(file))
-        values: dict[str, list[Any]] = {kind: [] for kind in KINDS}
-        assumed = []
-        missing: dict[str, tuple[str, ...]] = dict.fromkeys(KINDS, ())
-        for j, name in enumerate(body.joints):
-            for kind in KINDS:
-                value = given.get((name, kind), own[kind][j])
-                if value is None and kind == "acceleration":
-                    value = values["velocity"][-1] / STOPPING
-                    assumed.append(name)
-                if value is None:
-                    missing[kind] += (name,)
-                    value = math.nan
-                values[kind].append(value)
+        values = own | given
+        missing = {
+            kind: [name for name in body.joints if (name, kind) not in values]
+            for kind in ("position", "velocity", "torque")
+        }
         if any(missing.values()):
             raise _missing(body, missing)
-        arrays = {kind: np.array(value, dtype=float) for kind, value in values.items()}
-        notes = [*_suspicious(body, arrays, given), *_beyond(body, arrays, own)]
+        assumed = [name for name in body.joints if (name, "acceleration") not in values]
+        for name in assumed:
+            values[name, "acceleration"] = values[name, "velocity"] / STOPPING
+        arrays = {kind: np.array([values[name, kind] for name in body.joints]) for kind in KINDS}
+        notes = [*_suspicious(body, arrays, given), *_beyond(own, values)]
         if assumed:
             notes.append(
                 f"no acceleration is given for {listed(assumed)}: the velocity in {STOPPING:g} s "
@@ -138,10 +133,10 @@ def check_weight(body: Body, limits: Limits) -> None:
         )
 
 
-def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> SpecificationError:
+def _missing(body: Body, missing: Mapping[str, list[str]]) -> SpecificationError:
     """Return the error for limits that no file gives, with the lines that are to be filled in."""
     lacking = {kind: names for kind, names in missing.items() if names}
-    said = "; ".join(f"{kind} of {listed(list(names))}" for kind, names in lacking.items())
+    said = "; ".join(f"{kind} of {listed(names)}" for kind, names in lacking.items())
     every = {kind for kind, names in lacking.items() if len(names) == body.n}
     lines = ["joints:"]
     for name in ("default", *body.joints):
@@ -156,29 +151,29 @@ def _missing(body: Body, missing: Mapping[str, tuple[str, ...]]) -> Specificatio
     )
 
 
-def _own(body: Body) -> dict[str, list[Any]]:
-    """Return the limits in the robot's own file; None where it has none."""
-    model, torques, velocities = body.model, _torques(body), _velocities(body.source)
-    ids = model.dof_jntid[body.dofs]
-    return {
-        "position": [model.jnt_range[j].tolist() if model.jnt_limited[j] else None for j in ids],
-        "velocity": [velocities.get(name) for name in body.joints],
-        "acceleration": [None] * body.n,
-        "torque": [torques[j] if 0.0 < torques[j] < WIDE else None for j in ids],
-    }
+def _own(body: Body) -> dict[tuple[str, str], Any]:
+    """Return the limits in the robot's own file by joint and kind."""
+    model, torques, velocities, own = body.model, _torques(body), _velocities(body.source), {}
+    for name, j in zip(body.joints, model.dof_jntid[body.dofs], strict=True):
+        if model.jnt_limited[j]:
+            own[name, "position"] = model.jnt_range[j].tolist()
+        if velocity := velocities.get(name):
+            own[name, "velocity"] = velocity
+        if 0.0 < torques[j] < WIDE:
+            own[name, "torque"] = float(torques[j])
+    return own
 
 
-def _velocities(source: Path | None) -> dict[str | None, float | None]:
-    """Return the limits of velocity in an URDF, by its joints."""
+def _velocities(source: Path | None) -> dict[str | None, float]:
+    """Return the limits of velocity in an URDF, by its joints; 0 where it has none."""
     try:
         joints = Xml.fromstring(source.read_bytes().strip()).iter("joint") if source else ()
     except Xml.ParseError:  # of a prefix that is not declared, which the engine lets pass
         return {}
-    limits = ((joint.get("name"), joint.find("limit")) for joint in joints)
     return {
-        name: float(limit.get("velocity", 0.0)) or None
-        for name, limit in limits
-        if limit is not None
+        joint.get("name"): float(limit.get("velocity", 0.0))
+        for joint in joints
+        for limit in joint.findall("limit")
     }
 
 
@@ -278,17 +273,18 @@ def _suspicious(
         yield f"the range of {listed(wide)} is more than two turns: check it"
 
 
-def _beyond(body: Body, limits: Mapping[str, Array], own: Mapping[str, list[Any]]) -> Iterator[str]:
-    """Yield a sentence for each kind of limit that is beyond the one in the robot's file."""
-    for kind in KINDS:
-        names = [
-            name
-            for name, given, limit in zip(body.joints, limits[kind], own[kind], strict=True)
-            if limit is not None
-            and (np.max(given) > np.max(limit) or (kind == "position" and given[0] < limit[0]))
-        ]
-        if names:
-            yield f"the {kind} of {listed(names)} goes beyond the robot's file: check it"
+def _beyond(own: Mapping[tuple[str, str], Any], values: Mapping[tuple[str, str], Any]) -> list[str]:
+    """Return a sentence for each kind of limit that is beyond the one in the robot's file."""
+    found: dict[str, list[str]] = {}
+    for (name, kind), limit in own.items():
+        lower = kind == "position" and values[name, kind][0] < limit[0]
+        if lower or np.max(values[name, kind]) > np.max(limit):
+            found.setdefault(kind, []).append(name)
+    return [
+        f"the {kind} of {listed(found[kind])} goes beyond the robot's file: check it"
+        for kind in KINDS
+        if kind in found
+    ]
 
 
 def _unlike(source: Path, what: str, value: object, expected: str) -> SpecificationError:

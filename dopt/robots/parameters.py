@@ -10,12 +10,13 @@ import copy
 import dataclasses
 import fnmatch
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.optimize
 
 from dopt.errors import SpecificationError, unknown_name
-from dopt.robots.body import INERTIAL, SLIDE, Body, Motion, inertial_row, rotation
+from dopt.robots.body import Body, Motion, inertial
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -157,19 +158,11 @@ class Unknowns:
         # Short cuts of the engine for centres at 0 and constant inertias.
         model.body_sameframe[:] = model.body_simple[:] = model.dof_simplenum[:] = 0
         for one, value in zip(self.parameters, values, strict=True):
-            if one.kind in OF_JOINTS:
-                k = body.joints.index(one.place)
-                if one.kind == "gear":
-                    gears[k] = value
-                else:
-                    getattr(model, f"dof_{one.kind}")[body.dofs[k]] = value
-                continue
-            b, axis = body.moved[body.bodies.index(one.place)], "xyz".find(one.kind[-1])
-            if one.kind == "mass":
-                model.body_mass[b] = value
+            if one.kind == "gear":
+                gears[body.joints.index(one.place)] = value
             else:
-                part = model.body_ipos if one.kind.startswith("com") else model.body_inertia
-                part[b, axis] = value
+                numbers, at = _numbers(body, model, one.kind, one.place)
+                numbers[at] = value
         mujoco.mj_setConst(model, mujoco.MjData(model))
         result = copy.copy(self)
         result.body = Body(model, body.source)
@@ -198,31 +191,28 @@ class Unknowns:
         return found
 
     def _parameter(self, kind: str, place: str) -> Parameter:
-        model, unit = self.body.model, UNITS[kind]
+        body, limits, unit = self.body, self.limits, UNITS[kind]
+        if kind == "gear":
+            return Parameter(kind, place, 1.0, 1.0, unit)
+        numbers, at = _numbers(body, body.model, kind, place)
+        value = scale = float(numbers[at])
         if kind in OF_JOINTS:
-            k = self.body.joints.index(place)
-            dof = self.body.dofs[k]
-            if model.jnt_type[model.dof_jntid[dof]] == SLIDE:
-                unit = OF_SLIDES.get(kind, unit)
-            typical = FRICTION * self.limits.torque[k]
-            value, usual = {
-                "armature": (model.dof_armature[dof], 0.1 * self._inertia(k)),
-                "damping": (model.dof_damping[dof], typical / self.limits.velocity[k]),
-                "frictionloss": (model.dof_frictionloss[dof], typical),
-                "gear": (1.0, 1.0),
+            k = body.joints.index(place)
+            unit = OF_SLIDES[kind] if body.units[k] == "N" else unit
+            typical = FRICTION * limits.torque[k]
+            usual = {
+                "armature": 0.1 * self._inertia(k),
+                "damping": typical / limits.velocity[k],
+                "frictionloss": typical,
             }[kind]
-            return Parameter(kind, place, float(value), float(value or usual), unit)
-        b = self.body.moved[self.body.bodies.index(place)]
-        mass, moments = float(model.body_mass[b]), np.array(model.body_inertia[b])
-        if kind == "mass":
-            return Parameter(kind, place, mass, mass or 1.0, unit)
-        axis = "xyz".index(kind[-1])
-        if kind.startswith("com"):
+        elif kind.startswith("com"):
             # A centre at 0 has the size of the body, by its radius of gyration.
-            away = np.linalg.norm(model.body_ipos[b])
-            size = max(float(np.sqrt(moments.mean() / max(mass, 1e-9))), float(away), 1e-3)
-            return Parameter(kind, place, float(model.body_ipos[b][axis]), size, unit)
-        return Parameter(kind, place, float(moments[axis]), float(moments[axis]) or 1e-3, unit)
+            b, scale = at[0], 0.0
+            turning = body.model.body_inertia[b].mean() / max(body.model.body_mass[b], 1e-9)
+            usual = max(np.sqrt(turning), np.linalg.norm(body.model.body_ipos[b]), 1e-3)
+        else:
+            usual = 1.0 if kind == "mass" else 1e-3
+        return Parameter(kind, place, value, float(scale or usual), unit)
 
     def _inertia(self, k: int) -> float:
         """Return the inertia that joint ``k`` moves at home."""
@@ -240,11 +230,11 @@ class Unknowns:
         """
         body, model = self.body, self.body.model
         result = np.zeros((len(motion.positions), body.n, len(self)))
-        inertial = [i for i, one in enumerate(self.parameters) if one.kind not in OF_JOINTS]
+        of_bodies = [i for i, one in enumerate(self.parameters) if one.kind not in OF_JOINTS]
         needs_torques = any(one.kind == "gear" for one in self.parameters)
-        if inertial or needs_torques:
+        if of_bodies or needs_torques:
             rows = body.regressor(motion) if rigid is None else rigid
-            result[:, :, inertial] = rows @ self._directions
+            result[:, :, of_bodies] = rows @ self._directions
         signs = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
@@ -264,26 +254,23 @@ class Unknowns:
         return result * self.scales
 
     def _inertial_directions(self) -> Array:
-        """Return derivatives of the inertial parameters by unknowns of bodies, (10 · bodies, k)."""
-        body, model = self.body, self.body.model
-        ours = [one for one in self.parameters if one.kind not in OF_JOINTS]
-        result = np.zeros((INERTIAL * len(body.bodies), len(ours)))
-        for i, one in enumerate(ours):
-            which = body.bodies.index(one.place)
-            b = body.moved[which]
-            mass, c = float(model.body_mass[b]), np.array(model.body_ipos[b])
-            axis = "xyz".find(one.kind[-1])
-            unit = np.eye(3)[axis]
-            if one.kind == "mass":
-                change = inertial_row(1.0, c, c @ c * np.eye(3) - np.outer(c, c))
-            elif one.kind.startswith("com"):
-                about = 2.0 * c[axis] * np.eye(3) - np.outer(unit, c) - np.outer(c, unit)
-                change = inertial_row(0.0, mass * unit, mass * about)
-            else:
-                axes = rotation(model.body_iquat[b])
-                change = inertial_row(0.0, np.zeros(3), np.outer(axes[:, axis], axes[:, axis]))
-            result[INERTIAL * which : INERTIAL * (which + 1), i] = change
-        return result
+        """Return derivatives of the inertial parameters by unknowns of bodies, (10 · bodies, k).
+
+        They are of the second degree at most, of which central differences are exact.
+        """
+        body, model = self.body, copy.copy(self.body.model)
+        columns = []
+        for one in self.parameters:
+            if one.kind in OF_JOINTS:
+                continue
+            numbers, at = _numbers(body, model, one.kind, one.place)
+            value, ends = float(numbers[at]), []
+            for step in (one.scale, -one.scale):
+                numbers[at] = value + step
+                ends.append(inertial(model, body.moved))
+            numbers[at] = value
+            columns.append((ends[0] - ends[1]) / (2.0 * one.scale))
+        return np.array(columns).reshape(-1, body.inertial.size).T
 
     def information(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the information of a motion in relative units, (p, p).
@@ -302,6 +289,17 @@ class Unknowns:
         noise = self.noise * self.limits.torque
         result: Array = self.regressor(motion, rigid) * (np.sqrt(rate * motion.dt) / noise)[:, None]
         return result
+
+
+def _numbers(body: Body, model: Any, kind: str, place: str) -> tuple[Array, tuple[int, ...]]:
+    """Return the numbers of a model among which a parameter is, and where; gears are in none."""
+    if kind in OF_JOINTS:
+        return getattr(model, f"dof_{kind}"), (body.dofs[body.joints.index(place)],)
+    b = body.moved[body.bodies.index(place)]
+    if kind == "mass":
+        return model.body_mass, (b,)
+    numbers = model.body_ipos if kind.startswith("com") else model.body_inertia
+    return numbers, (b, "xyz".index(kind[-1]))
 
 
 @dataclasses.dataclass(frozen=True)

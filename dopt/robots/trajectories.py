@@ -10,9 +10,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
-from scipy.interpolate import BSpline
+from scipy.interpolate import BPoly, BSpline, CubicHermiteSpline
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csr_array, vstack
 from scipy.sparse.linalg import spsolve
@@ -82,6 +83,10 @@ class Family(ABC):
             Share of its amplitude that the motion has, for torques and collisions.
         """
 
+    def _times(self, dt: float) -> Array:
+        result: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        return result
+
     def _centres(self, numbers: Array) -> Array:
         """Return the positions about which joints move, (n,): the middle third of the ranges."""
         half = ROOM * np.diff(self.limits.position, axis=1)[:, 0] / 2.0
@@ -100,28 +105,32 @@ class Fourier(Family):
 
     period: float = 10.0
 
+    equal: ClassVar[bool] = False
+    """Whether the velocities of all lines are equally large."""
+
     @property
     def name(self) -> str:
         return f"Fourier, {self.period:g} s"
 
     @property
+    def rates(self) -> Array:
+        """Angular frequencies, (k,) [rad/s]."""
+        result: Array = 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
+        return result
+
+    @property
     def size(self) -> int:
-        return self.n * (2 * HARMONICS + 1)
+        return self.n * (2 * len(self.rates) + 1)
 
     def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
-        parts = numbers.reshape(2 * HARMONICS + 1, self.n)
-        rates: Array = 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
-        cosines, sines = parts[1 : HARMONICS + 1], parts[HARMONICS + 1 :]
-        return self._series(rates, cosines, sines, self._centres(parts[0]), dt, reach)
-
-    def _series(
-        self, rates: Array, cosines: Array, sines: Array, centres: Array, dt: float, reach: float
-    ) -> Motion:
         """Return Σ (a cos ωt + b sin ωt)/ω between ramps, as large as the limits allow."""
-        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        rates, parts = self.rates, numbers.reshape(-1, self.n)
+        centres, cosines, sines = self._centres(parts[0]), *np.split(parts[1:], 2)
+        sizes = (np.hypot(cosines, sines) if self.equal else 1.0) * rates[:, None]
+        t = self._times(dt)
         phase = np.outer(t, rates)
         c, s = np.cos(phase), np.sin(phase)
-        a, b = cosines / rates[:, None], sines / rates[:, None]
+        a, b = cosines / sizes, sines / sizes
         shape = c @ a + s @ b
         rate = (-s * rates) @ a + (c * rates) @ b
         turn = -(c * rates**2) @ a - (s * rates**2) @ b
@@ -131,14 +140,7 @@ class Fourier(Family):
         accelerations = w2 * shape + 2.0 * w1 * rate + w * turn
         half = np.diff(self.limits.position, axis=1)[:, 0] / 2.0
         room = half - np.abs(centres - self.limits.middle) / ROOM
-        taken = np.max(
-            [
-                np.abs(positions).max(axis=0) / room,
-                np.abs(velocities).max(axis=0) / self.limits.velocity,
-                np.abs(accelerations).max(axis=0) / self.limits.acceleration,
-            ],
-            axis=0,
-        )
+        taken = _taken(self.limits, room, positions, velocities, accelerations)
         size = reach * ROOM / np.maximum(taken, 1e-12)
         return Motion(dt, centres + size * positions, size * velocities, size * accelerations)
 
@@ -149,26 +151,14 @@ class Multisine(Fourier):
 
     fastest: float = 2.0
 
-    @property
-    def name(self) -> str:
-        return "multisine"
+    equal = True
+    name = "multisine"
 
     @property
-    def _lines(self) -> int:
-        return max(3, int(min(self.fastest * self.seconds, 20)))
-
-    @property
-    def size(self) -> int:
-        return self.n * (2 * self._lines + 1)
-
-    def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
-        lines = self._lines
-        parts = numbers.reshape(2 * lines + 1, self.n)
-        cosines, sines = parts[1 : lines + 1], parts[lines + 1 :]
-        sizes = np.hypot(cosines, sines)
-        rates = 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
-        centres = self._centres(parts[0])
-        return self._series(rates, cosines / sizes, sines / sizes, centres, dt, reach)
+    def rates(self) -> Array:
+        lines = max(3, int(min(self.fastest * self.seconds, 20)))
+        result: Array = 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
+        return result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +185,7 @@ class Ladder(Family):
     def motion(self, numbers: Array, dt: float, reach: float = 1.0) -> Motion:
         parts = numbers.reshape(self.segments + 1, self.n)
         centres = self._centres(parts[0])
-        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        t = self._times(dt)
         columns = []
         for k in range(self.n):
             low, high = self.limits.position[k]
@@ -240,7 +230,7 @@ class Spline(Family):
 
     def basis(self, dt: float) -> tuple[csr_array, csr_array, csr_array]:
         """Return positions, velocities and accelerations by the control points, (T, m) each."""
-        t: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
+        t = self._times(dt)
         knots = self._knot * np.arange(-3.0, self._count + 7.0)
         first, second = self._rates()
         return (
@@ -276,14 +266,8 @@ class Spline(Family):
         points = points.reshape(-1, self.n)
         limits, (first, second) = self.limits, self._rates()
         away = points - limits.middle
-        taken = np.max(
-            [
-                np.abs(away).max(axis=0) / (np.ptp(limits.position, axis=1) / 2.0),
-                np.abs(first @ points).max(axis=0) / limits.velocity,
-                np.abs(second @ points).max(axis=0) / limits.acceleration,
-            ],
-            axis=0,
-        )
+        room = np.ptp(limits.position, axis=1) / 2.0
+        taken = _taken(limits, room, away, first @ points, second @ points)
         result: Array = limits.middle + away / np.maximum(taken / ROOM, 1.0)
         return result.ravel()
 
@@ -335,22 +319,15 @@ class JointPath:
 
     def __init__(self, start: float, room: tuple[float, float], acceleration: float) -> None:
         self.room, self._mean = room, acceleration / 1.5  # by a ramp v = 3 s² - 2 s³
-        self._times, self._speeds = [0.0], [0.0]
-        self.position = float(np.clip(start, *room))
-        self._start = self.position
-
-    @property
-    def now(self) -> float:
-        return self._times[-1]
-
-    @property
-    def speed(self) -> float:
-        return self._speeds[-1]
+        self.position = self._start = float(np.clip(start, *room))
+        self.now = self.speed = 0.0
+        self._times, self._speeds = [self.now], [self.speed]
 
     def _to(self, speed: float, seconds: float) -> None:
         if seconds > 1e-9:
             self.position += 0.5 * (self.speed + speed) * seconds
-            self._times.append(self.now + seconds)
+            self.now, self.speed = self.now + seconds, speed
+            self._times.append(self.now)
             self._speeds.append(speed)
 
     def _way(self, speed: float) -> float:
@@ -393,16 +370,17 @@ class JointPath:
 
     def sampled(self, t: Array) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations at some times, (T,) each."""
-        times, speeds = np.array(self._times), np.array(self._speeds)
-        steps, changes = np.diff(times), np.diff(speeds)
-        ways = np.cumsum((speeds[1:] + speeds[:-1]) / 2.0 * steps)
-        places = self._start + np.concatenate([[0.0], ways])
-        at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(steps) - 1)
-        s = np.clip((t - times[at]) / steps[at], 0.0, 1.0)
-        step, change = steps[at], changes[at]
-        positions = places[at] + step * (speeds[at] * s + change * (s**3 - 0.5 * s**4))
-        velocities = speeds[at] + change * s**2 * (3.0 - 2.0 * s)
-        return positions, velocities, change / step * 6.0 * s * (1.0 - s)
+        rate = CubicHermiteSpline(self._times, self._speeds, np.zeros(len(self._times)))
+        return self._start + rate.antiderivative()(t), rate(t), rate.derivative()(t)
+
+
+def _taken(
+    limits: Limits, room: Array, positions: Array, velocities: Array, accelerations: Array
+) -> Array:
+    """Return the largest shares of a room for positions and of the limits of rates, (n,)."""
+    parts = positions / room, velocities / limits.velocity, accelerations / limits.acceleration
+    result: Array = np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
+    return result
 
 
 def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
@@ -410,12 +388,7 @@ def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
 
     A quintic with no velocity and no acceleration at its ends.
     """
-    ramp = min(RAMP, seconds / 10.0)
-    last = t[-1]
-    up, down = np.clip(t / ramp, 0.0, 1.0), np.clip((last - t) / ramp, 0.0, 1.0)
-    x = np.minimum(up, down)
-    sign = np.where(up <= down, 1.0, -1.0) / ramp
-    w = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    slope = 30.0 * x**2 * (1.0 - x) ** 2
-    bend = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
-    return w, sign * slope, bend / ramp**2
+    ramp, last = min(RAMP, seconds / 10.0), t[-1]
+    ends = [[height, 0.0, 0.0] for height in (0.0, 1.0, 1.0, 0.0)]
+    window = BPoly.from_derivatives([0.0, ramp, last - ramp, last], ends)
+    return window(t), window.derivative()(t), window.derivative(2)(t)

@@ -459,6 +459,27 @@ except SpecificationError as error:
     assert "a robot needs MuJoCo, which is not installed: pip install" in said
 
 
+@pytest.mark.parametrize("package", ["arm_description", "renamed"])
+def test_meshes_of_a_ros_package_are_found_in_its_folder(tmp_path: Path, package: str) -> None:
+    """Once they counted as not there, and contacts of their bodies were not looked at."""
+    for folder in ("urdf", "meshes"):
+        (tmp_path / package / folder).mkdir(parents=True)
+    corners = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\n"
+    faces = "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    (tmp_path / package / "meshes" / "link.obj").write_text(corners + faces)
+    source = tmp_path / package / "urdf" / "arm.urdf"
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    source.write_text(
+        f"""<robot name="r"><link name="base"/><link name="link"><inertial>
+        <mass value="1"/>{inertia}</inertial><collision><geometry>
+        <mesh filename="package://arm_description/meshes/link.obj"/></geometry></collision></link>
+        <joint name="j" type="revolute"><parent link="base"/><child link="link"/>
+        <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="9" velocity="2"/></joint></robot>"""
+    )
+    body = Body.load(source)
+    assert (body.model.nmesh, body.notes) == (1, ())
+
+
 def test_meshes_that_are_not_there_are_said(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(
         """<mujoco><asset><mesh name="m" file="parts/link.stl"/></asset><worldbody>

@@ -404,6 +404,12 @@ def test_an_encoder_that_stays_displaced_is_believed_after_a_while() -> None:
     assert explorer.counts["windows"] > windows
 
 
+def test_a_report_before_anything_is_learned_has_infinite_widths() -> None:
+    """Once it warned of a division by 0, also of joints that did not move later."""
+    joints = RobotExplorer(*small()).report()["joints"]
+    assert [one["relative_width"] for one in joints.values()] == [np.inf] * 3
+
+
 def test_a_gap_in_time_ends_the_window() -> None:
     explorer = RobotExplorer(*small())
     for k in range(10):
