@@ -211,7 +211,6 @@ def _run_work(arguments: argparse.Namespace) -> ExitCode:
     from orchestrate.runner.start import Output
     from orchestrate.runner.worker import run_worker
 
-    Reader.open(arguments.db).close()  # a worker creates no database
     names = ("processes", "timeout", "memory_gib", "retry_memory", "lease")
     given = {name: getattr(arguments, name) for name in names}
     output = Output(_to_stderr if arguments.json else say_still, _to_stderr, sys.stderr)

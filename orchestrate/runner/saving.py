@@ -62,17 +62,60 @@ T = TypeVar("T")
 Say = Callable[[str], None]
 
 
-class RetryingStore:
-    """Operations of one launch, each retried for ``seconds`` after its first failure.
+class Patience:
+    """Repetition of an operation on a database for ``seconds`` after its first failure.
 
-    A failed operation may have been executed, with only its answer lost. The operations of
-    :data:`IDEMPOTENT` are repeated as they are, without the number of the launch as argument;
-    ``claim``, ``commit`` and ``fail`` are repeated in a form that is harmless after that.
+    It is called with the operation, and with what to repeat where that is another one: a failed
+    operation may have been executed, with only its answer lost.
 
     Raises
     ------
     StoreUnavailableError
-        From every method, if the database stays unreachable, or at once if waiting cannot help.
+        If the database stays unreachable, or at once if waiting cannot help.
+    """
+
+    def __init__(self, seconds: float, say: Say) -> None:
+        self._seconds = seconds
+        self._say = say
+
+    def hurry(self) -> None:
+        """Wait no longer for a database that does not answer; a signal handler may call it."""
+        self._seconds = 0.0
+
+    def __call__(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
+        repeated = operation if again is None else again
+        try:
+            return operation()
+        except StoreUnavailableError as error:
+            if not error.transient:
+                raise
+            self._say(f"waiting for up to {self._seconds:g} s: {error}")
+        start, pause = time.monotonic(), FIRST_PAUSE_SECONDS
+        while True:
+            left = start + self._seconds - time.monotonic()
+            time.sleep(max(0.0, min(pause, left)))
+            pause = min(2 * pause, MAX_PAUSE_SECONDS)
+            try:
+                result = repeated()
+            except StoreUnavailableError as later:
+                if not later.transient or time.monotonic() - start >= self._seconds:
+                    raise
+            else:
+                self._say(f"the database is back after {time.monotonic() - start:.1f} s")
+                return result
+
+
+class RetryingStore:
+    """Operations of one launch, each repeated by ``patience``.
+
+    The operations of :data:`IDEMPOTENT` are repeated as they are, without the number of the launch
+    as argument; ``claim``, ``commit`` and ``fail`` are repeated in a form that is harmless after
+    one that was executed.
+
+    Raises
+    ------
+    StoreUnavailableError
+        From every method, as from :class:`Patience`.
 
     Attributes
     ----------
@@ -84,11 +127,11 @@ class RetryingStore:
 
     alike = False
 
-    def __init__(self, store: Store, launch: int, seconds: float, say: Say) -> None:
+    def __init__(self, store: Store, launch: int, patience: Patience) -> None:
         self._store = store
         self._launch = launch
-        self._seconds = seconds
-        self._say = say
+        self._patience = patience
+        self.hurry = patience.hurry
         self.safe_url = store.safe_url
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
@@ -97,10 +140,6 @@ class RetryingStore:
         launch = (self._launch,) if IDEMPOTENT[name] else ()
         operation = partial(getattr(self._store, name), *launch)
         return lambda *words: self._persist(lambda: operation(*words))
-
-    def hurry(self) -> None:
-        """Wait no longer for a database that does not answer; a signal handler may call it."""
-        self._seconds = 0.0
 
     def check(self) -> None:
         """Raise ``DatabaseMovedError`` if the file was removed, renamed or replaced."""
@@ -138,28 +177,7 @@ class RetryingStore:
         return self._persist(lambda: self._store.fail(claim, failure, run), again)
 
     def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
-        try:
-            return _whole(operation)
-        except StoreUnavailableError as error:
-            if not error.transient:
-                raise
-            self._say(f"waiting for up to {self._seconds:g} s: {error}")
-        return self._repeat(again or operation)
-
-    def _repeat(self, operation: Callable[[], T]) -> T:
-        start, pause = time.monotonic(), FIRST_PAUSE_SECONDS
-        while True:
-            left = start + self._seconds - time.monotonic()
-            time.sleep(max(0.0, min(pause, left)))
-            pause = min(2 * pause, MAX_PAUSE_SECONDS)
-            try:
-                result = _whole(operation)
-            except StoreUnavailableError as error:
-                if not error.transient or time.monotonic() - start >= self._seconds:
-                    raise
-            else:
-                self._say(f"the database is back after {time.monotonic() - start:.1f} s")
-                return result
+        return self._patience(partial(_whole, operation), partial(_whole, again or operation))
 
 
 def _whole(operation: Callable[[], T]) -> T:

@@ -26,7 +26,7 @@ from orchestrate.executors.limits import BYTES_PER_GIB
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
 from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally, handling
-from orchestrate.runner.saving import RetryingStore, launch_record
+from orchestrate.runner.saving import Patience, RetryingStore, launch_record
 from orchestrate.runner.scheduler import (
     MAX_CHUNK_TRIALS,
     SUSPECT_LOSSES,
@@ -35,7 +35,7 @@ from orchestrate.runner.scheduler import (
     memory_of_this_machine,
 )
 from orchestrate.runner.start import WORK, Output, Work, recorded_launch, started, worked
-from orchestrate.store import OpenConfig
+from orchestrate.store import OpenConfig, Reader
 
 WARNINGS = (*SIGNALS, signal.SIGUSR1)
 """Signals before a preemption; batch systems send SIGUSR1 when asked for a warning."""
@@ -90,7 +90,7 @@ def run_worker(
     Parameters
     ----------
     url
-        Database, which exists.
+        Database, which has to exist.
     output, work
         Destinations of messages, and functions that run a trial and prepare for it, by default
         :data:`orchestrate.runner.start.WORK`.
@@ -127,6 +127,8 @@ def run_worker(
     with handling(WARNINGS, interrupt):  # as Ctrl-C until trials are claimed
         record = launch_record(sys.argv, [], ROOT)
         start = time.monotonic()
+        patience = Patience(settings.patience, output.warn)
+        patience(lambda: Reader.open(url).close())  # a worker creates no database
         return recorded_launch(
             settings,
             record,

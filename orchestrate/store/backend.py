@@ -424,9 +424,8 @@ class Backend(ABC):
         NaN becomes NULL.
         """
 
-    @abstractmethod
-    def hold(self, connection: Connection, launch_id: int, token: str) -> None:
-        """Mark a new launch as alive, before others can see it."""
+    def hold(self, token: str) -> None:  # noqa: B027  a lease is a column of the launch
+        """Lock what says that a new launch is alive, before others can see it."""
 
     def renew(self, connection: Connection, launch_id: int) -> None:  # noqa: B027  a lock has none
         """Extend the lease of the launch."""

@@ -161,9 +161,18 @@ class Launches:
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
 
-    def begin_launch(self, record: LaunchRecord) -> int:
-        """Insert a launch that starts now and return its number."""
-        token = self._backend.token()
+    def new_token(self) -> str:
+        """Return a name for a launch, which no other one has."""
+        return self._backend.token()
+
+    def begin_launch(self, record: LaunchRecord, token: str | None = None) -> int:
+        """Insert a launch that starts now and return its number.
+
+        With a ``token`` of :meth:`new_token` it can be repeated: a launch of that name that is
+        there is alive again, although others may have taken it for dead meanwhile.
+        """
+        token = token or self._backend.token()
+        begun = select(launch_table.c.launch_id).where(launch_table.c.token == token)
         statement = insert(launch_table).values(
             token=token,
             state="running",
@@ -180,12 +189,15 @@ class Launches:
         )
         try:
             with self._backend.transaction() as connection:
-                inserted = connection.execute(statement.returning(launch_table.c.launch_id))
-                launch_id = int(inserted.scalar_one())
+                launch_id = connection.execute(begun).scalar_one_or_none()
+                if launch_id is None:
+                    inserted = connection.execute(statement.returning(launch_table.c.launch_id))
+                    launch_id = inserted.scalar_one()
                 # Before the transaction ends: no other process finds a launch without its lock or
                 # lease and takes it for dead.
-                self._backend.hold(connection, launch_id, token)
-                return launch_id
+                self._backend.hold(token)
+                renew(connection, self._backend, launch_id)
+                return int(launch_id)
         except BaseException:
             self._backend.forget(token)
             raise
