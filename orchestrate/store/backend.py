@@ -171,7 +171,7 @@ _TEMPORARY_REFUSALS = (
     "connection slots are reserved",
     "terminating connection",
 )
-_UNKNOWN_HOST = ("failed to resolve host", "could not translate host name")
+_UNKNOWN_PLACE = ("failed to resolve host", "could not translate host name", "invalid port number")
 
 
 def is_transient(error: BaseException | None, known_host: bool) -> bool:
@@ -188,7 +188,7 @@ def is_transient(error: BaseException | None, known_host: bool) -> bool:
         return str(state).startswith(_TRANSIENT_STATES)
     if type(error).__module__.partition(".")[0] != "psycopg":
         return False
-    if any(words in text for words in _UNKNOWN_HOST):
+    if any(words in text for words in _UNKNOWN_PLACE):
         return known_host
     return "FATAL:" not in text or any(words in text for words in _TEMPORARY_REFUSALS)
 

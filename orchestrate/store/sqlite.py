@@ -440,6 +440,11 @@ class SQLiteBackend(Backend):
                     f"The results database {self.safe_url} is a folder, but a file is expected: "
                     f"give one in it, such as sqlite:///{self._path / 'results.db'}."
                 )
+            if self._path.exists() and not self._path.is_file():
+                raise StoreError(
+                    f"The results database {self.safe_url} is a device, a pipe or a socket, but a "
+                    "file is expected: give another path."
+                )
             self._folder.mkdir(parents=True, exist_ok=True)
         self._locks = LaunchLocks(self._folder)
 
