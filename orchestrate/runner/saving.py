@@ -83,25 +83,22 @@ class Patience:
         self._seconds = 0.0
 
     def __call__(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
-        repeated = operation if again is None else again
-        try:
-            return operation()
-        except StoreUnavailableError as error:
-            if not error.transient:
-                raise
-            self._say(f"waiting for up to {self._seconds:g} s: {error}")
-        start, pause = time.monotonic(), FIRST_PAUSE_SECONDS
+        failed, pause = 0.0, FIRST_PAUSE_SECONDS
         while True:
-            left = start + self._seconds - time.monotonic()
-            time.sleep(max(0.0, min(pause, left)))
-            pause = min(2 * pause, MAX_PAUSE_SECONDS)
             try:
-                result = repeated()
-            except StoreUnavailableError as later:
-                if not later.transient or time.monotonic() - start >= self._seconds:
+                result = operation()
+            except StoreUnavailableError as error:
+                now = time.monotonic()
+                if not error.transient or (failed and now - failed >= self._seconds):
                     raise
+                if not failed:
+                    failed, operation = now, again or operation
+                    self._say(f"waiting for up to {self._seconds:g} s: {error}")
+                time.sleep(max(0.0, min(pause, failed + self._seconds - now)))
+                pause = min(2 * pause, MAX_PAUSE_SECONDS)
             else:
-                self._say(f"the database is back after {time.monotonic() - start:.1f} s")
+                if failed:
+                    self._say(f"the database is back after {time.monotonic() - failed:.1f} s")
                 return result
 
 
@@ -237,6 +234,7 @@ class ExplorationSaver:
         self._url = default_url() if url is None else str(url)
         self._store: Store | None = _opened(self._url)
         self._lock = threading.Lock()
+        self._token: str | None = None
         self._launch: int | None = None
         self._alive = ExitStack()
         self._last: Saved | None = None
@@ -264,7 +262,8 @@ class ExplorationSaver:
         if self._launch is None:
             if store.holds_more(spec, result):
                 return False
-            self._launch = store.begin_launch(self._record)
+            self._token = self._token or store.new_token()
+            self._launch = store.begin_launch(self._record, self._token)
             self._alive.enter_context(kept_alive(store, self._launch, LEASE_SECONDS))
         last, self._last = self._last, None  # whether a save that fails has written is unknown
         known = result.wall_seconds if math.isfinite(result.wall_seconds) else 0.0
@@ -282,7 +281,7 @@ class ExplorationSaver:
 
     def _end(self) -> None:
         store, launch = self._store, self._launch
-        self._store = self._launch = self._last = None
+        self._store = self._token = self._launch = self._last = None
         self._alive.close()
         if store is None:
             return

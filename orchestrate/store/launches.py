@@ -26,7 +26,6 @@ from sqlalchemy import (
 )
 
 from orchestrate.errors import LaunchAliveError
-from orchestrate.store import schema
 from orchestrate.store.backend import Backend, LaunchLife, NewTrial
 from orchestrate.store.records import (
     Claim,
@@ -99,6 +98,7 @@ class OpenTrial:
     lone_losses: int = 0
 
 
+# Of trials that code with the fingerprint of the launch has registered.
 _ALIKE = (
     "registered_by IN (SELECT l.launch_id FROM launch l JOIN launch m "
     "ON coalesce(m.fingerprint, '') = coalesce(l.fingerprint, '') WHERE m.launch_id = :launch)"
@@ -271,7 +271,7 @@ class Launches:
             .with_for_update(skip_locked=True)
         )
         if alike:
-            free = free.where(trial.c.registered_by.in_(schema.alike(launch)))
+            free = free.where(text(_ALIKE).bindparams(launch=launch))
         statement = (
             update(trial)
             .where(trial.c.trial_id.in_(free))
@@ -537,12 +537,12 @@ def _take_over(
     """Let workers with the code of this launch run trials that other code has registered."""
     if not keys:
         return
-    ours = trial.c.registered_by.in_(schema.alike(launch_id))
+    theirs = text(f"NOT {_ALIKE}").bindparams(launch=launch_id)
     others = (
         select(trial.c.trial_id)
         .where(trial.c.trial_key.in_(backend.members(keys)))
         .where(trial.c.status.not_in(("running", *FINISHED)))
-        .where(or_(trial.c.registered_by.is_(None), ~ours))
+        .where(or_(trial.c.registered_by.is_(None), theirs))
         .with_for_update(skip_locked=True)
     )
     taken = update(trial).where(trial.c.trial_id.in_(others))
