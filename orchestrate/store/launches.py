@@ -58,9 +58,9 @@ if TYPE_CHECKING:
     from dopt.spec.trial import MarkedTrial, TrialSpec
 
 
-@dataclass(frozen=True)
+@dataclass
 class OpenConfig:
-    """Configuration with trials that have no outcome.
+    """Configuration with trials that have no outcome; a worker keeps the numbers up to date.
 
     Attributes
     ----------
