@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib import metadata
@@ -62,6 +63,7 @@ T = TypeVar("T")
 Say = Callable[[str], None]
 
 
+@dataclass
 class Patience:
     """Repetition of an operation on a database for ``seconds`` after its first failure.
 
@@ -74,13 +76,12 @@ class Patience:
         If the database stays unreachable, or at once if waiting cannot help.
     """
 
-    def __init__(self, seconds: float, say: Say) -> None:
-        self._seconds = seconds
-        self._say = say
+    seconds: float
+    say: Say
 
     def hurry(self) -> None:
         """Wait no longer for a database that does not answer; a signal handler may call it."""
-        self._seconds = 0.0
+        self.seconds = 0.0
 
     def __call__(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
         failed, pause = 0.0, FIRST_PAUSE_SECONDS
@@ -89,16 +90,16 @@ class Patience:
                 result = operation()
             except StoreUnavailableError as error:
                 now = time.monotonic()
-                if not error.transient or (failed and now - failed >= self._seconds):
+                if not error.transient or (failed and now - failed >= self.seconds):
                     raise
                 if not failed:
                     failed, operation = now, again or operation
-                    self._say(f"waiting for up to {self._seconds:g} s: {error}")
-                time.sleep(max(0.0, min(pause, failed + self._seconds - now)))
+                    self.say(f"waiting for up to {self.seconds:g} s: {error}")
+                time.sleep(max(0.0, min(pause, failed + self.seconds - now)))
                 pause = min(2 * pause, MAX_PAUSE_SECONDS)
             else:
                 if failed:
-                    self._say(f"the database is back after {time.monotonic() - failed:.1f} s")
+                    self.say(f"the database is back after {time.monotonic() - failed:.1f} s")
                 return result
 
 

@@ -72,7 +72,10 @@ class Leave:
 
 
 def run_worker(
-    settings: LaunchSettings, output: Output, seconds: float | None = None, work: Work = WORK
+    settings: LaunchSettings,
+    output: Output,
+    seconds: float | None = None,
+    work: Work | None = None,
 ) -> ExitCode:
     """Run pending trials of a database until none is left, the time is over or a signal comes.
 
@@ -81,7 +84,8 @@ def run_worker(
     settings
         Database, which has to exist, number of trials at once, limits, lease and patience.
     output, work
-        Destinations of messages, and functions that run a trial and prepare for it.
+        Destinations of messages, and functions that run a trial and prepare for it, by default
+        :data:`orchestrate.runner.start.WORK`.
     seconds
         Time after which nothing is held any more; None until no trial is left.
 
@@ -108,7 +112,7 @@ def run_worker(
             settings,
             record,
             output,
-            lambda store: _work(store, settings, seconds, work, output, start),
+            lambda store: _work(store, settings, seconds, work or WORK, output, start),
         )
 
 

@@ -200,11 +200,6 @@ class Reader:
         """Close the connections."""
         self._engine.dispose()
 
-    @property
-    def url(self) -> str:
-        """URL of the database, with its password."""
-        return self._url.render_as_string(hide_password=False)
-
     @contextmanager
     def moment(self) -> Iterator[Self]:
         """Open a reader whose methods all read one snapshot, for one thread and a short time."""
