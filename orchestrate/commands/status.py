@@ -12,7 +12,6 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
-from dopt.process import usable_cores
 from orchestrate.commands import (
     Command,
     add_filters,
@@ -199,22 +198,13 @@ def _add_work_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_work(arguments: argparse.Namespace) -> ExitCode:
     """Run trials until none is left, the time is over, or a signal comes."""
-    from orchestrate.config import LaunchSettings, factor
     from orchestrate.runner.start import Output
     from orchestrate.runner.worker import run_worker
 
-    limits = {name: getattr(arguments, name) for name in ("timeout", "memory_gib", "lease")}
-    more = factor("--retry-memory", arguments.retry_memory, "--memory-gib", arguments.memory_gib)
-    settings = LaunchSettings(
-        executor="local",
-        store_url=arguments.db,
-        workers=arguments.processes or usable_cores(),
-        retry_memory=more,
-        patience=min(30.0, arguments.lease / 2),
-        **limits,
-    )
+    names = ("processes", "timeout", "memory_gib", "retry_memory", "lease")
+    given = {name: getattr(arguments, name) for name in names}
     output = Output(_to_stderr if arguments.json else say_still, _to_stderr, sys.stderr)
-    code = run_worker(settings, output, arguments.until)
+    code = run_worker(arguments.db, output, seconds=arguments.until, **given)
     if arguments.json:
         say_json({"exit_code": code.value, "complete": code in (0, ExitCode.SOME_FAILED)})
     return code

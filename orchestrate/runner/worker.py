@@ -15,9 +15,10 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from dopt.errors import DoptError
+from dopt.process import usable_cores
 from dopt.spec.config import TrialConfig, completed
 from dopt.spec.trial import TrialSpec, stored_trial
-from orchestrate.config import LaunchSettings
+from orchestrate.config import LaunchSettings, factor
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task, check_processes
 from orchestrate.executors.limits import BYTES_PER_GIB
@@ -72,30 +73,50 @@ class Leave:
 
 
 def run_worker(
-    settings: LaunchSettings,
+    url: str,
     output: Output,
-    seconds: float | None = None,
     work: Work | None = None,
+    *,
+    seconds: float | None = None,
+    processes: int | None = None,
+    timeout: float | None = 3600.0,
+    memory_gib: float | None = None,
+    retry_memory: float | None = None,
+    lease: float = 60.0,
 ) -> ExitCode:
     """Run pending trials of a database until none is left, the time is over or a signal comes.
 
     Parameters
     ----------
-    settings
-        Database, which has to exist, number of trials at once, limits, lease and patience.
+    url
+        Database, which has to exist.
     output, work
         Destinations of messages, and functions that run a trial and prepare for it, by default
         :data:`orchestrate.runner.start.WORK`.
     seconds
         Time after which nothing is held any more; None until no trial is left.
+    processes
+        Trials at once; None for one on each core that this process may use.
+    timeout, memory_gib, retry_memory, lease
+        As in :class:`orchestrate.config.LaunchSettings`.
 
     Raises
     ------
     LaunchError
-        If more processes are asked for than a machine can start.
+        If ``retry_memory`` raises no limit, or no machine can start so many processes.
     StoreError, InfrastructureError
         As :func:`orchestrate.runner.start.launch_grid`.
     """
+    settings = LaunchSettings(
+        executor="local",
+        store_url=url,
+        workers=processes or usable_cores(),
+        timeout=timeout,
+        memory_gib=memory_gib,
+        retry_memory=factor("--retry-memory", retry_memory, "--memory-gib", memory_gib),
+        lease=lease,
+        patience=min(30.0, lease / 2),
+    )
     check_processes(settings)
     repeated = Repetition()
 
@@ -107,7 +128,7 @@ def run_worker(
         record = launch_record(sys.argv, [], ROOT)
         start = time.monotonic()
         patience = Patience(settings.patience, output.warn)
-        patience(lambda: Reader.open(settings.store_url).close())  # a worker creates no database
+        patience(lambda: Reader.open(url).close())  # a worker creates no database
         return recorded_launch(
             settings,
             record,

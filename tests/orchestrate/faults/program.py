@@ -144,11 +144,9 @@ def _pull(order: Order, work: Work) -> int:
     if order.tick:
         clock = Clock(Gate(Path(order.gate)), order.tick)
         worker.time = worker.time = clock  # type: ignore[assignment]
-    given = dict(order.worker or {})
-    seconds, lease = given.pop("seconds", None), given.get("lease", 60.0)
-    settings = LaunchSettings("local", order.url, workers=2, patience=lease / 2, **given)
+    settings = {"processes": 2, **dict(order.worker or {})}
     try:
-        return run_worker(settings, Output(start.say, start.say, sys.stderr), seconds, work)
+        return run_worker(order.url, Output(start.say, start.say, sys.stderr), work, **settings)
     except StoreUnavailableError as error:
         sys.stderr.write(f"{error}\n")
         return ExitCode.INFRASTRUCTURE
