@@ -26,8 +26,9 @@ def whole(what: str, given: object, lower: int = -LARGEST_WHOLE, upper: int = LA
     if not _is_real(given, "iu") or not lower <= int(given) <= upper:  # type: ignore[call-overload]
         least = f" of at least {lower}" if lower > -LARGEST_WHOLE else ""
         bounds = f" from {lower} to {upper:,}" if upper != LARGEST_WHOLE else least
+        shown = "null" if given is None else repr(given)
         raise SpecificationError(
-            f"{what} is {given!r}, but a whole number{bounds} is expected: correct it."
+            f"{what} is {shown}, but a whole number{bounds} is expected: correct it."
         )
     return int(given)  # type: ignore[call-overload,no-any-return]
 

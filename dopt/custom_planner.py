@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
 from dopt.arguments import as_array
 from dopt.control.task import Feedback
-from dopt.errors import SpecificationError
-from dopt.learning import Adam
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.learning import LEARNERS, Adam
 from dopt.learning.base import CustomLearner, Updater
 from dopt.models import MLP
 from dopt.policies import POLICIES, Disagreement
@@ -18,6 +20,8 @@ from dopt.randomness import stream
 from dopt.registry import check_returned
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView
+
+T = TypeVar("T")
 
 OVERFLOWING = 1e30
 """Size of a parameter from which on a plan may overflow that is right."""
@@ -38,13 +42,12 @@ def custom_planner(spec: TrialSpec) -> Planner | None:
         assert isinstance(spec.learner, Adam)
         return policy.network_planner(system, spec.model, spec.learner, rng)
     if isinstance(policy, TaskPolicy):
-        method, plan = "task_planner", policy.task_planner(system, spec.config.goal, rng)
+        method, make = "task_planner", partial(policy.task_planner, system, spec.config.goal, rng)
     else:
-        method, plan = "planner", policy.planner(system, rng)
+        method, make = "planner", partial(policy.planner, system, rng)
     if type(policy) in POLICIES.values():
-        return plan
-    check_returned(f"policy '{policy.name}'", method, plan, Planner)
-    return _Checked(policy.name, plan)
+        return make()
+    return _Checked(policy.name, _made(f"policy '{policy.name}'", method, make, Planner))
 
 
 def custom_updater(spec: TrialSpec) -> Updater | None:
@@ -58,9 +61,46 @@ def custom_updater(spec: TrialSpec) -> Updater | None:
     learner = spec.learner
     if not isinstance(learner, CustomLearner):
         return None
-    updater = learner.updater(spec.system, stream(spec.seed, "updater"))
-    check_returned(f"learner '{learner.name}'", "updater", updater, Updater)
-    return updater
+    make = partial(learner.updater, spec.system, stream(spec.seed, "updater"))
+    return _made(f"learner '{learner.name}'", "updater", make, Updater)
+
+
+def _made(whose: str, method: str, make: Callable[[], T], base: type) -> T:
+    """Return what a method of a user's class makes, or raise ``SpecificationError``."""
+    try:
+        found = make()
+    except TypeError as error:
+        if "abstract" not in str(error):
+            raise
+        raise SpecificationError(
+            f"{method}() of {whose} makes an object that lacks a method ({error}): define it."
+        ) from error
+    check_returned(whose, method, found, base)
+    return found
+
+
+def check_custom_parts(specs: Iterable[TrialSpec]) -> None:
+    """Make one plan and one update of each user's class among the policies and learners.
+
+    Other errors than those of missing methods are left to the trials: they may be of some alone.
+
+    Raises
+    ------
+    SpecificationError
+        If a method is missing, in the plan or the update or in what should be one.
+    """
+    shipped = (*POLICIES.values(), *LEARNERS.values())
+    own = {type(part): (part, spec) for spec in specs for part in (spec.policy, spec.learner)}
+    for kind, (part, spec) in own.items():
+        if kind in shipped:
+            continue
+        try:
+            custom_planner(spec) if part is spec.policy else custom_updater(spec)
+        except SpecificationError as error:
+            if not isinstance(error, IncompatibleError):
+                raise
+        except Exception:
+            continue
 
 
 class _Checked(Planner):

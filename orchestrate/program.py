@@ -176,10 +176,23 @@ def check_removed(typed: str) -> None:
         raise UsageError(sentence)
 
 
+LARGEST = 1_000_000_000
+"""Bound of seconds and GiB: system timers and limits overflow above it."""
+
+
 def positive(option: str, number: type[int] | type[float]) -> Callable[[str], float]:
-    """Return the argument type for a number above 0."""
+    """Return the argument type for a number above 0 and below ``LARGEST``."""
     expected = f"a {'whole number' if number is int else 'number'} above 0"
-    return partial(_number, option, number, expected, lambda value: 0 < value < float("inf"))
+
+    def read(given: str) -> float:
+        value: float = _number(
+            option, number, expected, lambda value: 0 < value < float("inf"), given
+        )
+        if value >= LARGEST:
+            raise UsageError(f"{option} is {given!r}, less than {LARGEST:,} is expected: give it.")
+        return value
+
+    return read
 
 
 def integer(option: str) -> Callable[[str], int]:

@@ -49,28 +49,18 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="position, velocity, acceleration and torque of each joint (as in ROBOT)",
     )
     parser.add_argument("--check", action="store_true", help="say only what is identifiable")
-    parser.add_argument(
-        "--seconds", type=positive("--seconds", float), default=20.0, help="duration [s] (20)"
-    )
-    parser.add_argument(
-        "--noise",
-        type=positive("--noise", float),
-        default=0.01,
-        help="standard deviation of a measured torque, as a share of its limit (0.01)",
-    )
-    parser.add_argument(
-        "--rate",
-        type=positive("--rate", float),
-        default=500.0,
-        help="independent measurements a second, and rows of the CSV file [Hz] (500)",
-    )
     parser.add_argument("--seed", type=integer("--seed"), default=0, help="seed of the search (0)")
-    parser.add_argument(
-        "--effort",
-        type=positive("--effort", int),
-        default=40,
-        help="motions that are tried to improve the best random one (40)",
-    )
+    noise = "standard deviation of a measured torque, as a share of its limit"
+    rate = "independent measurements a second, and rows of the CSV file [Hz]"
+    effort = "motions that are tried to improve the best random one"
+    for option, default, text in (
+        ("--seconds", 20.0, "duration [s]"),
+        ("--noise", 0.01, noise),
+        ("--rate", 500.0, rate),
+        ("--effort", 40, effort),
+    ):
+        number = positive(option, type(default))
+        parser.add_argument(option, type=number, default=default, help=f"{text} ({default:g})")
     parser.add_argument(
         "--out",
         type=path("--out"),

@@ -171,6 +171,8 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_query(arguments: argparse.Namespace) -> ExitCode:
     """Print the rows, and a note on the standard error if there are more."""
+    if arguments.csv and arguments.json:
+        raise UsageError("--csv and --json are two forms of one answer: leave one of them out.")
     whole = arguments.csv or arguments.json
     limit = arguments.limit or (None if whole else DEFAULT_LIMIT)
     with Reader.open(arguments.db) as reader:

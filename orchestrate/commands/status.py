@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any
 
 from rich.console import RenderableType
@@ -186,25 +185,16 @@ def _add_work_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="trials at once (default: one for each core that this process may use)",
     )
-    number = partial(positive, number=float)
-    parser.add_argument(
-        "--timeout", type=number("--timeout"), default=3600.0, help="seconds that a trial may take"
-    )
-    parser.add_argument(
-        "--memory-gib", type=number("--memory-gib"), metavar="GIB", help="memory of one process"
-    )
-    parser.add_argument(
-        "--retry-memory",
-        type=number("--retry-memory"),
-        metavar="FACTOR",
-        help="run a trial that exceeds --memory-gib once more, with so many times as much",
-    )
-    parser.add_argument(
-        "--lease",
-        type=number("--lease"),
-        default=60.0,
-        help="seconds for which a worker that is lost keeps its trials on PostgreSQL",
-    )
+    more = "run a trial that exceeds --memory-gib once more, with so many times as much"
+    lost = "seconds for which a worker that is lost keeps its trials on PostgreSQL"
+    for option, default, shown, text in (
+        ("--timeout", 3600.0, None, "seconds that a trial may take"),
+        ("--memory-gib", None, "GIB", "memory of one process"),
+        ("--retry-memory", None, "FACTOR", more),
+        ("--lease", 60.0, None, lost),
+    ):
+        number = positive(option, float)
+        parser.add_argument(option, type=number, default=default, metavar=shown, help=text)
 
 
 def _run_work(arguments: argparse.Namespace) -> ExitCode:
@@ -212,7 +202,6 @@ def _run_work(arguments: argparse.Namespace) -> ExitCode:
     from orchestrate.runner.start import Output
     from orchestrate.runner.worker import run_worker
 
-    Reader.open(arguments.db).close()  # a worker creates no database
     names = ("processes", "timeout", "memory_gib", "retry_memory", "lease")
     given = {name: getattr(arguments, name) for name in names}
     output = Output(_to_stderr if arguments.json else say_still, _to_stderr, sys.stderr)

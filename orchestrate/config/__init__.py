@@ -8,17 +8,20 @@ the range.
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain, zip_longest
 from typing import Any
 
+from dopt.custom_planner import check_custom_parts
 from dopt.errors import IncompatibleError, SpecificationError, stripped, unknown_name
 from dopt.registry import name_of
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from orchestrate.errors import LaunchError
+from orchestrate.program import LARGEST
 
 TRIAL_SECTIONS = (
     *("env", "plant", "policy", "model", "learner"),
@@ -96,7 +99,8 @@ def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> 
     Raises
     ------
     SpecificationError
-        If a value is unknown, of the wrong type or out of bounds, or if nothing is left.
+        If a value is unknown, of the wrong type or out of bounds, if nothing is left, or if what
+        runs of a user's class lacks a method.
     """
     combinations = list(combinations)
     by_config: list[list[TrialSpec]] = []
@@ -121,6 +125,7 @@ def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> 
         raise SpecificationError(
             f"the grid is empty: {' '.join(left_out) or 'no trial was requested'}"
         )
+    check_custom_parts(one[0] for one in by_config if one)
     return Grid(trials, n_jobs, left_out, tuple(_notes(combinations)))
 
 
@@ -132,9 +137,6 @@ def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
         names = dict.fromkeys(name_of(part) for part in having if isinstance(part, Mapping))
         yield f"{key} applies to {group}={','.join(names)} only"
 
-
-LARGEST = 1_000_000_000
-"""Bound of seconds and GiB: system timers and limits overflow above it."""
 
 _PRECISION = re.compile(r"ci\s*<\s*(\d+(?:\.\d+)?)\s*%")
 
@@ -163,7 +165,8 @@ def setting(
 
 def wrong(key: str, value: object, expected: str) -> LaunchError:
     """Return the error for a setting with an invalid value."""
-    return LaunchError(f"{key} is {value!r}, but {expected} is expected: change {key}.")
+    typed = json.dumps(value) if isinstance(value, bool | None) else repr(value)
+    return LaunchError(f"{key} is {typed}, but {expected} is expected: change {key}.")
 
 
 def _amount(unit: str) -> str:

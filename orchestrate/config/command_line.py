@@ -15,6 +15,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -165,7 +166,13 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
         raise UsageError(f"{' and '.join(several)} cannot be combined: leave one out.")
     if flags.resolve and not (flags.cfg or flags.help):
         raise UsageError("--resolve goes with --cfg or --help: add one of them.")
+    if flags.config_dir and not Path(flags.config_dir).is_dir():
+        raise UsageError(
+            f"--config-dir is '{flags.config_dir}', but a folder is expected: give one that exists."
+        )
     for word in flags.overrides:
+        if word.startswith("="):
+            raise UsageError(f"'{word}' names no key: write key=value, such as env=arm.")
         check_removed(word)
         check_removed(word.partition("=")[0])
         if _NEEDED.fullmatch(word):

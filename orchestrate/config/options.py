@@ -46,7 +46,12 @@ from hydra.errors import (
     OverrideParseException,
 )
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+)
 
 from dopt.errors import DoptError, SpecificationError, suggestion, unknown_name
 from dopt.registry import TARGET, imported
@@ -422,10 +427,16 @@ def format_error(error: Exception) -> str:
         return _one_line(str(error))
     if isinstance(error, MissingConfigException) and error.options:
         return _unknown_option(str(error.missing_cfg_file), error.options)
+    if isinstance(error, MissingConfigException):
+        return (
+            f"there is no configuration {error.missing_cfg_file!r}: leave --config-name out, or "
+            "name the folder of its file with --config-dir FOLDER."
+        )
     if isinstance(error, OverrideParseException) and _BARE.fullmatch(error.override):
         return f"'{error.override}' is not an override: write key=value, such as env=arm."
     if isinstance(error, OverrideParseException):
-        reason = "" if "Lexer" in str(error.message) else f" ({_one_line(str(error.message))})"
+        told = str(error.message)
+        reason = "" if "Lexer" in told or "expecting" in told else f" ({_one_line(told)})"
         return (
             f"cannot read the override '{error.override}'{reason}: put a value with special "
             "characters into quotes of its own, as in \"env.name='a=b'\"."
@@ -440,6 +451,11 @@ def format_error(error: Exception) -> str:
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) else error
     if isinstance(cause, ConfigAttributeError | ConfigKeyError) and cause.full_key:
         return _unknown_key(cause)
+    if isinstance(cause, InterpolationResolutionError):
+        return (
+            f"what {cause.full_key or 'a setting'} refers to with ${{...}} cannot be found "
+            f"({_one_line(str(cause))}): name a setting, or oc.env: and a variable that is set."
+        )
     if isinstance(cause, OmegaConfBaseException) and cause is not error:
         return _one_line(f"{error} {cause}")
     if isinstance(error, HydraException | OmegaConfBaseException):
@@ -466,30 +482,6 @@ def _unknown_key(cause: OmegaConfBaseException) -> str:
     if isinstance(parent, DictConfig) and TARGET in names:
         return str(unknown_field(key, str(parent[TARGET]), names))
     return str(unknown_setting(key, names))
-
-
-def check_launch(launch: Mapping[str, object]) -> None:
-    """Refuse an unknown setting of the launch, its store or its executor.
-
-    Parameters
-    ----------
-    launch
-        The sections ``launch``, ``store`` and ``executor`` in plain types.
-    """
-    executor = launch["executor"]
-    name = executor.get("name") if isinstance(executor, Mapping) else None
-    _check("launch", launch["launch"], content_of(CONFIGURATION / "config.yaml").get("launch"))
-    _check("store", launch["store"], {"url": None})
-    _check("executor", executor, content_of(CONFIGURATION / "executor" / f"{name}.yaml"))
-
-
-def _check(path: str, given: object, known: object) -> None:
-    if not isinstance(given, Mapping) or not isinstance(known, Mapping) or not known:
-        return
-    for key, value in given.items():
-        if key not in known:
-            raise unknown_name(f"setting of {path}", key, map(str, known))
-        _check(f"{path}.{key}", value, known[key])
 
 
 @functools.cache

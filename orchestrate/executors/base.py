@@ -26,6 +26,7 @@ from dopt.errors import UnusableEnvironmentError, unknown_name
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import LaunchSettings
+from orchestrate.errors import LaunchError
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 
@@ -244,6 +245,19 @@ class ExecutorFactory:
     in_process: bool = False
     options: tuple[str, ...] | None = None
     limiting_key: str = "launch.workers"
+
+
+MOST_PROCESSES = 1000
+"""Processes on one machine above which a number is a mistake."""
+
+
+def check_processes(settings: LaunchSettings) -> None:
+    """Raise ``LaunchError`` if more processes are asked for than a machine can start."""
+    if settings.workers and settings.workers > MOST_PROCESSES:
+        raise LaunchError(
+            f"{settings.workers:,} processes are asked for, but at most {MOST_PROCESSES:,} on one "
+            "machine are expected: set launch.workers (of work: --processes) lower."
+        )
 
 
 def limits_of(settings: LaunchSettings) -> Limits:

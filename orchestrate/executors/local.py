@@ -37,6 +37,7 @@ from orchestrate.executors.base import (
     Task,
     TaskDone,
     WorkerLost,
+    check_processes,
     limits_of,
     run_task,
 )
@@ -254,6 +255,7 @@ def _standard_error() -> Iterator[int]:
 FACTORY = ExecutorFactory(
     make=lambda settings, run, _: LocalExecutor(run, settings.workers, limits_of(settings)),
     trials_at_once=lambda settings: settings.workers or usable_cores(),
+    check=check_processes,
     options=(),
 )
 

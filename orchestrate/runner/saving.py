@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib import metadata
@@ -62,17 +63,57 @@ T = TypeVar("T")
 Say = Callable[[str], None]
 
 
-class RetryingStore:
-    """Operations of one launch, each retried for ``seconds`` after its first failure.
+@dataclass
+class Patience:
+    """Repetition of an operation on a database for ``seconds`` after its first failure.
 
-    A failed operation may have been executed, with only its answer lost. The operations of
-    :data:`IDEMPOTENT` are repeated as they are, without the number of the launch as argument;
-    ``claim``, ``commit`` and ``fail`` are repeated in a form that is harmless after that.
+    It is called with the operation, and with what to repeat where that is another one: a failed
+    operation may have been executed, with only its answer lost.
 
     Raises
     ------
     StoreUnavailableError
-        From every method, if the database stays unreachable, or at once if waiting cannot help.
+        If the database stays unreachable, or at once if waiting cannot help.
+    """
+
+    seconds: float
+    say: Say
+
+    def hurry(self) -> None:
+        """Wait no longer for a database that does not answer; a signal handler may call it."""
+        self.seconds = 0.0
+
+    def __call__(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
+        failed, pause = 0.0, FIRST_PAUSE_SECONDS
+        while True:
+            try:
+                result = operation()
+            except StoreUnavailableError as error:
+                now = time.monotonic()
+                if not error.transient or (failed and now - failed >= self.seconds):
+                    raise
+                if not failed:
+                    failed, operation = now, again or operation
+                    self.say(f"waiting for up to {self.seconds:g} s: {error}")
+                time.sleep(max(0.0, min(pause, failed + self.seconds - now)))
+                pause = min(2 * pause, MAX_PAUSE_SECONDS)
+            else:
+                if failed:
+                    self.say(f"the database is back after {time.monotonic() - failed:.1f} s")
+                return result
+
+
+class RetryingStore:
+    """Operations of one launch, each repeated by ``patience``.
+
+    The operations of :data:`IDEMPOTENT` are repeated as they are, without the number of the launch
+    as argument; ``claim``, ``commit`` and ``fail`` are repeated in a form that is harmless after
+    one that was executed.
+
+    Raises
+    ------
+    StoreUnavailableError
+        From every method, as from :class:`Patience`.
 
     Attributes
     ----------
@@ -84,11 +125,11 @@ class RetryingStore:
 
     alike = False
 
-    def __init__(self, store: Store, launch: int, seconds: float, say: Say) -> None:
+    def __init__(self, store: Store, launch: int, patience: Patience) -> None:
         self._store = store
         self._launch = launch
-        self._seconds = seconds
-        self._say = say
+        self._patience = patience
+        self.hurry = patience.hurry
         self.safe_url = store.safe_url
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
@@ -97,10 +138,6 @@ class RetryingStore:
         launch = (self._launch,) if IDEMPOTENT[name] else ()
         operation = partial(getattr(self._store, name), *launch)
         return lambda *words: self._persist(lambda: operation(*words))
-
-    def hurry(self) -> None:
-        """Wait no longer for a database that does not answer; a signal handler may call it."""
-        self._seconds = 0.0
 
     def check(self) -> None:
         """Raise ``DatabaseMovedError`` if the file was removed, renamed or replaced."""
@@ -138,28 +175,7 @@ class RetryingStore:
         return self._persist(lambda: self._store.fail(claim, failure, run), again)
 
     def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
-        try:
-            return _whole(operation)
-        except StoreUnavailableError as error:
-            if not error.transient:
-                raise
-            self._say(f"waiting for up to {self._seconds:g} s: {error}")
-        return self._repeat(again or operation)
-
-    def _repeat(self, operation: Callable[[], T]) -> T:
-        start, pause = time.monotonic(), FIRST_PAUSE_SECONDS
-        while True:
-            left = start + self._seconds - time.monotonic()
-            time.sleep(max(0.0, min(pause, left)))
-            pause = min(2 * pause, MAX_PAUSE_SECONDS)
-            try:
-                result = _whole(operation)
-            except StoreUnavailableError as error:
-                if not error.transient or time.monotonic() - start >= self._seconds:
-                    raise
-            else:
-                self._say(f"the database is back after {time.monotonic() - start:.1f} s")
-                return result
+        return self._patience(partial(_whole, operation), partial(_whole, again or operation))
 
 
 def _whole(operation: Callable[[], T]) -> T:
@@ -219,6 +235,7 @@ class ExplorationSaver:
         self._url = default_url() if url is None else str(url)
         self._store: Store | None = _opened(self._url)
         self._lock = threading.Lock()
+        self._token: str | None = None
         self._launch: int | None = None
         self._alive = ExitStack()
         self._last: Saved | None = None
@@ -246,7 +263,8 @@ class ExplorationSaver:
         if self._launch is None:
             if store.holds_more(spec, result):
                 return False
-            self._launch = store.begin_launch(self._record)
+            self._token = self._token or store.new_token()
+            self._launch = store.begin_launch(self._record, self._token)
             self._alive.enter_context(kept_alive(store, self._launch, LEASE_SECONDS))
         last, self._last = self._last, None  # whether a save that fails has written is unknown
         known = result.wall_seconds if math.isfinite(result.wall_seconds) else 0.0
@@ -264,7 +282,7 @@ class ExplorationSaver:
 
     def _end(self) -> None:
         store, launch = self._store, self._launch
-        self._store = self._launch = self._last = None
+        self._store = self._token = self._launch = self._last = None
         self._alive.close()
         if store is None:
             return

@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TextIO
 
@@ -31,7 +31,7 @@ from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.base import Executor, Run, executor_factory, make_executor
 from orchestrate.program import ROOT, answered, exit_code, say, tell
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
-from orchestrate.runner.saving import RetryingStore, kept_alive, launch_record
+from orchestrate.runner.saving import Patience, RetryingStore, kept_alive, launch_record
 from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memory
 from orchestrate.store import (
     FINISHED,
@@ -40,7 +40,6 @@ from orchestrate.store import (
     NoDatabaseError,
     Reader,
     Registration,
-    SchemaVersionError,
     Store,
     StoreUnavailableError,
     TrialRow,
@@ -87,7 +86,12 @@ class Output:
 
 
 def launch_grid(
-    grid: Grid, settings: LaunchSettings, record: LaunchRecord, work: Work, output: Output
+    grid: Grid,
+    settings: LaunchSettings,
+    record: LaunchRecord,
+    work: Work,
+    output: Output,
+    tally: Tally | None = None,
 ) -> ExitCode:
     """Bring every trial of the grid to an outcome, or leave that to workers.
 
@@ -99,6 +103,8 @@ def launch_grid(
         Provenance of the command.
     work, output
         Functions that run a trial and prepare for it, and destinations of messages.
+    tally
+        Takes the counts of the outcomes, if given.
 
     Raises
     ------
@@ -112,7 +118,7 @@ def launch_grid(
 
     def body(store: RetryingStore) -> ExitCode:
         free_trials(store, grid, settings)
-        run = _GridRun(store, grid, settings, work, output)
+        run = _GridRun(store, grid, settings, work, output, tally or Tally(0))
         return run.leave_to_workers() if settings.detach else run.until_all_ended()
 
     return recorded_launch(settings, record, output, body)
@@ -131,11 +137,13 @@ def recorded_launch(
     StoreError, InfrastructureError
         If the database or the workers fail; claims are released if that is possible.
     """
-    with Store.open(settings.store_url, settings.lease, settings.patience) as store:
-        launch = store.begin_launch(record)
+    patience = Patience(settings.patience, output.warn)
+    with Store.open(settings.store_url, settings.lease, settings.patience, patience) as store:
+        token = store.new_token()
+        launch = patience(lambda: store.begin_launch(record, token))
         try:
             with kept_alive(store, launch, settings.lease):
-                patient = RetryingStore(store, launch, settings.patience, output.warn)
+                patient = RetryingStore(store, launch, patience)
                 try:
                     code = body(patient)
                 except KeyboardInterrupt:
@@ -167,7 +175,7 @@ class _GridRun:
     settings: LaunchSettings
     work: Work
     output: Output
-    tally: Tally = field(default_factory=lambda: Tally(0))
+    tally: Tally
 
     def leave_to_workers(self) -> ExitCode:
         state = self.store.register(self.grid.trials)
@@ -426,10 +434,9 @@ def launch_trial(
     """
     if not executor_factory(settings).in_process:
         settings = dataclasses.replace(settings, executor="inprocess")
-    before = _attempts(trial, settings.store_url)
-    grid = Grid([trial], n_jobs=1, left_out={})
+    grid, tally = Grid([trial], n_jobs=1, left_out={}), Tally(0)
     quiet = Output(lambda _: None, lambda text: tell(sys.stderr, f"{text}\n"))  # one line is told
-    code = launch_grid(grid, settings, record, work, quiet)
+    code = launch_grid(grid, settings, record, work, quiet, tally)
     with Reader.open(settings.store_url) as reader:
         row = _row(reader, trial)
         if row is None:  # interrupted before it was registered
@@ -438,21 +445,11 @@ def launch_trial(
             found = reader.rows(_TRACEBACK, key=trial.trial_key)
             tell(sys.stderr, str(found[0][0]) if found else "")
         outcome = _outcome(row)
-        if row.attempt == before and row.status == "done":
+        if not tally.over and row.status == "done":
             outcome = f"already done, nothing to run · {outcome}"
-        elif row.attempt == before and row.status != "pending":
+        elif not tally.over and row.status in RETRIED:
             outcome = f"already run (launch.retry={row.status} runs it again) · {outcome}"
         return code, f"{_name(trial)} · {outcome} · {reader.safe_url}"
-
-
-def _attempts(trial: TrialSpec, url: str) -> int:
-    """Return how often the trial has been started; 0 where there is no database yet."""
-    try:
-        with Reader.open(url) as reader:
-            row = _row(reader, trial)
-    except (NoDatabaseError, SchemaVersionError):  # none yet, or Store.open explains it
-        return 0
-    return 0 if row is None else row.attempt
 
 
 def _row(reader: Reader, trial: TrialSpec) -> TrialRow | None:

@@ -12,7 +12,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from types import FrameType
 
 from dopt.errors import DoptError
@@ -21,12 +20,12 @@ from dopt.spec.config import TrialConfig, completed
 from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config import LaunchSettings, factor
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Task
+from orchestrate.executors.base import Task, check_processes
 from orchestrate.executors.limits import BYTES_PER_GIB
 from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.program import ROOT
 from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally, handling
-from orchestrate.runner.saving import RetryingStore, launch_record
+from orchestrate.runner.saving import Patience, RetryingStore, launch_record
 from orchestrate.runner.scheduler import (
     MAX_CHUNK_TRIALS,
     SUSPECT_LOSSES,
@@ -35,7 +34,7 @@ from orchestrate.runner.scheduler import (
     memory_of_this_machine,
 )
 from orchestrate.runner.start import WORK, Output, Work, recorded_launch, started, worked
-from orchestrate.store import OpenConfig
+from orchestrate.store import OpenConfig, Reader
 
 WARNINGS = (*SIGNALS, signal.SIGUSR1)
 """Signals before a preemption; batch systems send SIGUSR1 when asked for a warning."""
@@ -90,7 +89,7 @@ def run_worker(
     Parameters
     ----------
     url
-        Database, which exists.
+        Database, which has to exist.
     output, work
         Destinations of messages, and functions that run a trial and prepare for it, by default
         :data:`orchestrate.runner.start.WORK`.
@@ -104,7 +103,7 @@ def run_worker(
     Raises
     ------
     LaunchError
-        If ``retry_memory`` raises no limit.
+        If ``retry_memory`` raises no limit, or no machine can start so many processes.
     StoreError, InfrastructureError
         As :func:`orchestrate.runner.start.launch_grid`.
     """
@@ -118,6 +117,7 @@ def run_worker(
         lease=lease,
         patience=min(30.0, lease / 2),
     )
+    check_processes(settings)
     repeated = Repetition()
 
     def interrupt(number: int, _: FrameType | None) -> None:
@@ -127,6 +127,8 @@ def run_worker(
     with handling(WARNINGS, interrupt):  # as Ctrl-C until trials are claimed
         record = launch_record(sys.argv, [], ROOT)
         start = time.monotonic()
+        patience = Patience(settings.patience, output.warn)
+        patience(lambda: Reader.open(url).close())  # a worker creates no database
         return recorded_launch(
             settings,
             record,
@@ -201,23 +203,6 @@ UNKNOWN_SHARE = 0.5
 """Share of the worker's whole time that a trial of a configuration without a measured one gets."""
 
 
-@dataclass
-class Kind:
-    """Configuration with pending trials, as this worker knows it.
-
-    Attributes
-    ----------
-    mean, longest
-        Measured wall time of its trials [s]; None before the first one has ended.
-    """
-
-    config_id: int
-    first: TrialSpec
-    pending: int
-    mean: float | None
-    longest: float | None
-
-
 class StoredChunks(Chunks):
     """Queue whose trials are pending in the database, where other workers take them too.
 
@@ -255,7 +240,8 @@ class StoredChunks(Chunks):
         self._length = length
         self._end = None if length is None else time.monotonic() + length
         self._warn = warn
-        self._kinds: dict[str, Kind] = {}
+        self._kinds: dict[str, OpenConfig] = {}
+        self._firsts: dict[str, TrialSpec] = {}  # the trial with seed 0 of each
         self._refused: set[str] = set()
         self._left: set[str] = set()
         self._submitted: deque[float] = deque(maxlen=2 * slots)
@@ -266,8 +252,7 @@ class StoredChunks(Chunks):
         start = time.monotonic()
         self._store.recover()
         open_configs = self._store.open_configs()
-        kinds = (self._kind(config) for config in open_configs)
-        self._kinds = {kind.first.config_key: kind for kind in kinds if kind is not None}
+        self._kinds = {one.config_key: one for one in open_configs if self._runs_here(one)}
         counts = {config.config_key: config.pending + config.running for config in open_configs}
         self.left = sum(counts.values()) + self._count_others()
         self.left_here = sum(counts[key] for key in self._kinds)
@@ -294,12 +279,13 @@ class StoredChunks(Chunks):
         for trial in self._store.suspects(SUSPECT_LOSSES):
             if trial.config_id in by_id and self._room(by_id[trial.config_id]):
                 self.lone_losses[trial.trial_key] = trial.lone_losses
-                self.add_exclusive([by_id[trial.config_id].first.with_seed(trial.seed)])
+                first = self._firsts[by_id[trial.config_id].config_key]
+                self.add_exclusive([first.with_seed(trial.seed)])
 
     @property
     def configs(self) -> list[TrialConfig]:
         """Configurations that have open trials and can run here."""
-        return [kind.first.config for kind in self._kinds.values()]
+        return [self._firsts[key].config for key in self._kinds]
 
     @property
     def waiting(self) -> int:
@@ -318,8 +304,8 @@ class StoredChunks(Chunks):
         self.left -= 1
         self.left_here -= 1
         if kind := self._kinds.get(config_key):
-            kind.mean = self._costs[config_key]
-            kind.longest = max(seconds, kind.longest or 0.0)
+            kind.mean_seconds = self._costs[config_key]
+            kind.max_seconds = max(seconds, kind.max_seconds or 0.0)
 
     def next(self) -> list[Task]:
         """Return trials to claim: some of them may be gone by then; none if nothing fits."""
@@ -340,36 +326,37 @@ class StoredChunks(Chunks):
                 return self._given(kind, chunk)
         return []
 
-    def _given(self, kind: Kind, chunk: list[Task]) -> list[Task]:
+    def _given(self, kind: OpenConfig, chunk: list[Task]) -> list[Task]:
         self._submitted.append(len(chunk) * self._bound(kind))
         return chunk
 
-    def _take(self, kind: Kind) -> list[Task]:
+    def _take(self, kind: OpenConfig) -> list[Task]:
         """Return pending trials of a configuration, and queue those that killed a process."""
         size = self._size(kind)
         found = self._store.open_trials(kind.config_id, size, SUSPECT_LOSSES)
         kind.pending = max(0, kind.pending - len(found)) if len(found) == size else 0
-        specs = [(trial, kind.first.with_seed(trial.seed)) for trial in found]
+        first = self._firsts[kind.config_key]
+        specs = [(trial, first.with_seed(trial.seed)) for trial in found]
         self.add((spec for trial, spec in specs if trial.crashes), alone=True)
         chunk = [Task(spec.trial_key, spec) for trial, spec in specs if not trial.crashes]
         return chunk or (super().next() if self._alone else [])
 
-    def _candidates(self) -> Iterator[Kind]:
+    def _candidates(self) -> Iterator[OpenConfig]:
         """Yield the configurations of which a trial fits, the longest first, unknown ones before.
 
         A long trial that starts last would keep one process busy while the others have nothing.
         """
         waiting = (kind for kind in self._kinds.values() if kind.pending)
-        ordered = sorted(waiting, key=lambda kind: -(kind.mean or float("inf")))
+        ordered = sorted(waiting, key=lambda kind: -(kind.mean_seconds or float("inf")))
         return (kind for kind in ordered if self._room(kind))
 
-    def _size(self, kind: Kind) -> int:
-        if kind.mean is None:
+    def _size(self, kind: OpenConfig) -> int:
+        if kind.mean_seconds is None:
             return 1
         most = min(MAX_CHUNK_TRIALS, max(1, kind.pending // (2 * self.slots)), self._room(kind))
-        return max(1, min(most, int(self._seconds / max(kind.mean, 1e-9))))
+        return max(1, min(most, int(self._seconds / max(kind.mean_seconds, 1e-9))))
 
-    def _room(self, kind: Kind) -> int:
+    def _room(self, kind: OpenConfig) -> int:
         """Return how many trials of a configuration, one after the other, end in time."""
         if self._end is None:
             return MAX_CHUNK_TRIALS
@@ -378,26 +365,27 @@ class StoredChunks(Chunks):
         seconds = self._end - time.monotonic() - before
         return max(0, min(MAX_CHUNK_TRIALS, int(seconds / max(self._bound(kind), 1e-9))))
 
-    def _bound(self, kind: Kind) -> float:
+    def _bound(self, kind: OpenConfig) -> float:
         """Return the time [s] that a trial of a configuration is assumed to take at most."""
-        if kind.longest is not None:
-            return MARGIN * kind.longest
+        if kind.max_seconds is not None:
+            return MARGIN * kind.max_seconds
         return UNKNOWN_SHARE * (self._length or 0.0)
 
-    def _kind(self, config: OpenConfig) -> Kind | None:
-        """Return a configuration as this process builds it, or None if it cannot."""
-        known = self._kinds.get(config.config_key)
-        if config.config_key in self._refused:
-            return None
+    def _runs_here(self, config: OpenConfig) -> bool:
+        """Return whether this process can build a configuration; take over what it measured."""
+        key = config.config_key
+        if key in self._refused:
+            return False
         try:
-            first = known.first if known else trial_of(config, self.slots)
+            self._firsts[key] = self._firsts.get(key) or trial_of(config, self.slots)
         except DoptError as error:
-            self._refused.add(config.config_key)
+            self._refused.add(key)
             self._warn(f"{config.pending:,} trials are left to other workers: {error}")
-            return None
-        mean = self._costs.get(config.config_key, config.mean_seconds)
-        longest = max(config.max_seconds or 0.0, (known and known.longest) or 0.0) or None
-        return Kind(config.config_id, first, config.pending, mean, longest)
+            return False
+        longest = (one.max_seconds or 0.0 for one in (config, self._kinds.get(key, config)))
+        config.mean_seconds = self._costs.get(key, config.mean_seconds)
+        config.max_seconds = max(longest) or None
+        return True
 
 
 def trial_of(config: OpenConfig, at_once: int) -> TrialSpec:

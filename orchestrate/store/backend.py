@@ -171,7 +171,7 @@ _TEMPORARY_REFUSALS = (
     "connection slots are reserved",
     "terminating connection",
 )
-_UNKNOWN_HOST = ("failed to resolve host", "could not translate host name")
+_UNKNOWN_PLACE = ("failed to resolve host", "could not translate host name", "invalid port number")
 
 
 def is_transient(error: BaseException | None, known_host: bool) -> bool:
@@ -188,7 +188,7 @@ def is_transient(error: BaseException | None, known_host: bool) -> bool:
         return str(state).startswith(_TRANSIENT_STATES)
     if type(error).__module__.partition(".")[0] != "psycopg":
         return False
-    if any(words in text for words in _UNKNOWN_HOST):
+    if any(words in text for words in _UNKNOWN_PLACE):
         return known_host
     return "FATAL:" not in text or any(words in text for words in _TEMPORARY_REFUSALS)
 
@@ -424,9 +424,8 @@ class Backend(ABC):
         NaN becomes NULL.
         """
 
-    @abstractmethod
-    def hold(self, connection: Connection, launch_id: int, token: str) -> None:
-        """Mark a new launch as alive, before others can see it."""
+    def hold(self, token: str) -> None:  # noqa: B027  a lease is a column of the launch
+        """Lock what says that a new launch is alive, before others can see it."""
 
     def renew(self, connection: Connection, launch_id: int) -> None:  # noqa: B027  a lock has none
         """Extend the lease of the launch."""

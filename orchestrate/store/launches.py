@@ -26,7 +26,6 @@ from sqlalchemy import (
 )
 
 from orchestrate.errors import LaunchAliveError
-from orchestrate.store import schema
 from orchestrate.store.backend import Backend, LaunchLife, NewTrial
 from orchestrate.store.records import (
     Claim,
@@ -59,9 +58,9 @@ if TYPE_CHECKING:
     from dopt.spec.trial import MarkedTrial, TrialSpec
 
 
-@dataclass(frozen=True)
+@dataclass
 class OpenConfig:
-    """Configuration with trials that have no outcome.
+    """Configuration with trials that have no outcome; a worker keeps the numbers up to date.
 
     Attributes
     ----------
@@ -99,6 +98,7 @@ class OpenTrial:
     lone_losses: int = 0
 
 
+# Of trials that code with the fingerprint of the launch has registered.
 _ALIKE = (
     "registered_by IN (SELECT l.launch_id FROM launch l JOIN launch m "
     "ON coalesce(m.fingerprint, '') = coalesce(l.fingerprint, '') WHERE m.launch_id = :launch)"
@@ -161,9 +161,18 @@ class Launches:
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
 
-    def begin_launch(self, record: LaunchRecord) -> int:
-        """Insert a launch that starts now and return its number."""
-        token = self._backend.token()
+    def new_token(self) -> str:
+        """Return a name for a launch, which no other one has."""
+        return self._backend.token()
+
+    def begin_launch(self, record: LaunchRecord, token: str | None = None) -> int:
+        """Insert a launch that starts now and return its number.
+
+        With a ``token`` of :meth:`new_token` it can be repeated: a launch of that name that is
+        there is alive again, although others may have taken it for dead meanwhile.
+        """
+        token = token or self._backend.token()
+        begun = select(launch_table.c.launch_id).where(launch_table.c.token == token)
         statement = insert(launch_table).values(
             token=token,
             state="running",
@@ -180,12 +189,15 @@ class Launches:
         )
         try:
             with self._backend.transaction() as connection:
-                inserted = connection.execute(statement.returning(launch_table.c.launch_id))
-                launch_id = int(inserted.scalar_one())
+                launch_id = connection.execute(begun).scalar_one_or_none()
+                if launch_id is None:
+                    inserted = connection.execute(statement.returning(launch_table.c.launch_id))
+                    launch_id = inserted.scalar_one()
                 # Before the transaction ends: no other process finds a launch without its lock or
                 # lease and takes it for dead.
-                self._backend.hold(connection, launch_id, token)
-                return launch_id
+                self._backend.hold(token)
+                renew(connection, self._backend, launch_id)
+                return int(launch_id)
         except BaseException:
             self._backend.forget(token)
             raise
@@ -259,7 +271,7 @@ class Launches:
             .with_for_update(skip_locked=True)
         )
         if alike:
-            free = free.where(trial.c.registered_by.in_(schema.alike(launch)))
+            free = free.where(text(_ALIKE).bindparams(launch=launch))
         statement = (
             update(trial)
             .where(trial.c.trial_id.in_(free))
@@ -525,12 +537,12 @@ def _take_over(
     """Let workers with the code of this launch run trials that other code has registered."""
     if not keys:
         return
-    ours = trial.c.registered_by.in_(schema.alike(launch_id))
+    theirs = text(f"NOT {_ALIKE}").bindparams(launch=launch_id)
     others = (
         select(trial.c.trial_id)
         .where(trial.c.trial_key.in_(backend.members(keys)))
         .where(trial.c.status.not_in(("running", *FINISHED)))
-        .where(or_(trial.c.registered_by.is_(None), ~ours))
+        .where(or_(trial.c.registered_by.is_(None), theirs))
         .with_for_update(skip_locked=True)
     )
     taken = update(trial).where(trial.c.trial_id.in_(others))

@@ -215,9 +215,6 @@ class PostgreSQLBackend(Backend):
             for row in zip(repeat(trial_id), count(first), *columns, strict=False):
                 copy.write_row(row)
 
-    def hold(self, connection: Connection, launch_id: int, token: str) -> None:  # noqa: ARG002
-        self.renew(connection, launch_id)
-
     def renew(self, connection: Connection, launch_id: int) -> None:
         until = _clock(connection) + self._lease_seconds
         connection.execute(

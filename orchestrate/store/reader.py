@@ -140,9 +140,7 @@ def _launch(row: Mapping[str, Any], alive: bool) -> LaunchRow:
 
 
 _CONFIGS = text(
-    "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
-    "p.gamma, p.label, p.n_done, p.n_diverged, p.n_failed, p.n_cancelled, p.n_pending, "
-    "p.n_running, c.config_json "
+    f"SELECT {', '.join(f'p.{one.name}' for one in fields(ConfigRow)[:-1])}, c.config_json "
     "FROM v_progress p JOIN config c ON c.config_key = p.config_key"
 )
 _TRIALS = text(
@@ -201,11 +199,6 @@ class Reader:
     def close(self) -> None:
         """Close the connections."""
         self._engine.dispose()
-
-    @property
-    def url(self) -> str:
-        """URL of the database, with its password."""
-        return self._url.render_as_string(hide_password=False)
 
     @contextmanager
     def moment(self) -> Iterator[Self]:

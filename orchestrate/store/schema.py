@@ -26,13 +26,10 @@ from sqlalchemy import (
     Integer,
     LargeBinary,
     MetaData,
-    Select,
     Table,
     Text,
     UniqueConstraint,
-    func,
     inspect,
-    select,
     text,
 )
 from sqlalchemy.types import TypeEngine
@@ -296,13 +293,6 @@ attempt = _table(
     Index("attempt_by_end", "ended"),
     rowid=False,
 )
-
-
-def alike(launch_id: int) -> Select[tuple[int]]:
-    """Return the launches with the fingerprint of this one, as a one-column query for ``IN``."""
-    mine = select(func.coalesce(launch.c.fingerprint, "")).where(launch.c.launch_id == launch_id)
-    same = func.coalesce(launch.c.fingerprint, "") == mine.scalar_subquery()
-    return select(launch.c.launch_id).where(same)
 
 
 _CONFIG = "c.config_key, c.label, c.env, c.policy, c.model, c.learner, c.width, c.depth"

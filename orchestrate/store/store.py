@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -104,21 +104,30 @@ class Store(Launches):
 
     @classmethod
     def open(
-        cls, url: str, lease_seconds: float = LEASE_SECONDS, patience: float = PATIENCE_SECONDS
+        cls,
+        url: str,
+        lease_seconds: float = LEASE_SECONDS,
+        patience: float = PATIENCE_SECONDS,
+        repeat: Callable[[Callable[[], None]], None] = lambda create: create(),
     ) -> Self:
         """Open a database; create it where nothing is yet.
 
         ``lease_seconds`` is the time after its last heartbeat for which a launch on PostgreSQL is
         alive; on SQLite a file lock decides. ``patience`` bounds the wait for a lock of another
-        process [s]. Raises ``SchemaVersionError`` for another version.
+        process [s]. ``repeat`` calls what creates or checks the tables, and may do so again after
+        a failure. Raises ``SchemaVersionError`` for another version.
         """
         backend = make_backend(parse_url(url), lease_seconds, patience)
-        try:
+
+        def create() -> None:
             with backend.creation() as connection:
                 if schema.is_empty(connection):
                     schema.create(connection)
                 else:
                     schema.check(connection, backend.safe_url)
+
+        try:
+            repeat(create)
         except BaseException:
             backend.close()
             raise

@@ -67,6 +67,23 @@ class Coin(CustomPolicy):
         return Answer(lambda _: rng.choice(sides, size=m) / np.sqrt(m))
 
 
+class Watching(Planner):
+    """A plan without a choice."""
+
+    def observe(self, view: TrialView) -> None:
+        """Look on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unfinished(CustomPolicy):
+    """Makes a plan that lacks its choice."""
+
+    name: ClassVar[str] = "unfinished"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return Watching()  # type: ignore[abstract]  # as a user may forget it
+
+
 @dataclass(frozen=True, kw_only=True)
 class InTorch(Coin):
     """Says that it is written in torch."""

@@ -16,7 +16,6 @@ from sqlalchemy.engine import make_url
 from tabulate import tabulate
 
 from tests.orchestrate.faults.laboratory import Laboratory, Launched, Server
-from tests.waiting import until
 
 GOES_ON = (0,)
 """It ends only when the grid is complete."""
@@ -72,12 +71,7 @@ def interrupt_twice(scene: Scene) -> None:
 
 
 def sleep_while_another_runs(scene: Scene) -> None:
-    """Stop the driver for longer than a lease, and let another launch work meanwhile.
-
-    It has begun by then: a launch that loses its connection while it registers itself, as another
-    one ends the session of a stopped holder of a lock, asks to be run again.
-    """
-    until(lambda: scene.launched.said or not scene.launched.process.is_alive())
+    """Stop the driver for longer than a lease, and let another launch work meanwhile."""
     scene.launched.send(signal.SIGSTOP)
     with scene.laboratory.launched(executor="inprocess"):
         time.sleep(1.5 * scene.laboratory.order.settings["lease"])

@@ -7,7 +7,14 @@ import sys
 
 from dopt.process import usable_cores
 from orchestrate.config import LaunchSettings
-from orchestrate.executors.base import Executor, ExecutorFactory, Prepare, Run, limits_of
+from orchestrate.executors.base import (
+    Executor,
+    ExecutorFactory,
+    Prepare,
+    Run,
+    check_processes,
+    limits_of,
+)
 
 if "ray" not in sys.modules:
     # Ray reads this when it is first imported. A driver without it takes its raylet for dead if the
@@ -30,4 +37,9 @@ def _trials_at_once(settings: LaunchSettings) -> int | None:
     return settings.workers or usable_cores()
 
 
-FACTORY = ExecutorFactory(_make, _trials_at_once, options=())
+def _check(settings: LaunchSettings) -> None:
+    if settings.ray_address == "local":
+        check_processes(settings)
+
+
+FACTORY = ExecutorFactory(_make, _trials_at_once, _check, options=())

@@ -12,6 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import Control
+from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
@@ -169,6 +170,22 @@ def test_a_grid_holds_trials_of_both_paths() -> None:
     assert same == [trial.trial_key for trial in grid.trials if trial.model.name == "Stack"]
 
 
+@pytest.mark.parametrize(
+    ("section", "target", "sentence"),
+    [
+        ("policy", "custom_plugins.Unfinished", r"planner\(\) of policy 'unfinished' .*choose"),
+        ("policy", "test_plugins.Bringing", r"planner\(\) of policy 'bringing' returned None"),
+        ("learner", "test_plugins.Teaching", r"updater\(\) of learner 'teaching' returned None"),
+    ],
+)
+def test_a_class_whose_plan_or_update_lacks_a_method_is_refused(
+    section: str, target: str, sentence: str
+) -> None:
+    own = combination(**{section: {"_target_": f"tests.dopt.{target}"}})
+    with pytest.raises(SpecificationError, match=sentence):
+        build_grid([combination(), own])
+
+
 CommandLine = Callable[..., tuple[int, str, str]]
 
 TRIAL = ("env.horizon=5", "executor=inprocess")
@@ -210,7 +227,9 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.until=ci<100%", "launch.until is 'ci<100%', but null or ci<P%"),
         ("launch.until=ci<5", "P percent), such as 'ci<5%', is expected: change launch.until."),
         ("launch.until=5", "launch.until is 5, but null or ci<P%"),
-        ("launch.lease=null", "launch.lease"),
+        ("launch.lease=null", "launch.lease is null, but"),
+        ("launch.detach=null", "launch.detach is null, but"),
+        ("seed=null", "seed is null, but"),
         ("assess.sample_loss=yes please", "'assess' is {'sample_loss': 'yes please'}, but"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
         ("launch.patience=60", "launch.patience is 60, but less than launch.lease=60 is expected"),

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import psycopg
+from sqlalchemy import Engine, event
 
 from orchestrate.config import LaunchSettings
 from orchestrate.config.command_line import Request
@@ -49,6 +50,9 @@ class Order:
     pause
         Where the driver stops for ever: before it claims, in the middle of a commit, or
         on PostgreSQL in the middle of what it sends: the steps of a trial, or a claim.
+    stop
+        Beginning of the first statement before which the driver stops itself, until it is sent
+        SIGCONT.
     settings
         Further settings of the launch.
     tick
@@ -68,6 +72,7 @@ class Order:
     trouble: str = ""
     gate: str = ""
     pause: str = ""
+    stop: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     tick: float = 0.0
     worker: Mapping[str, Any] | None = None
@@ -86,6 +91,8 @@ def carry_out(order: Order, output: Path) -> None:
         _start_again(order, output)
     if order.pause:
         _PAUSES[order.pause](lambda: _stop_for_ever(output.with_suffix(".paused")))
+    if order.stop:
+        _stop_before(order.stop)
     try:
         sys.exit(_launch(order))
     except KeyboardInterrupt:  # also while a library is imported
@@ -203,6 +210,17 @@ def _pause_in_pipeline(stop: Callable[[], None]) -> None:
             stop()
 
     psycopg.Cursor.executemany = some  # type: ignore[assignment]
+
+
+def _stop_before(beginning: str) -> None:
+    stops = iter([signal.SIGSTOP])
+
+    def listen(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        if statement.strip().startswith(beginning):
+            for number in stops:
+                os.kill(os.getpid(), number)
+
+    event.listen(Engine, "before_cursor_execute", listen)
 
 
 def _stop_for_ever(mark: Path) -> None:

@@ -16,7 +16,7 @@ from orchestrate.config import Combination, Grid, LaunchSettings, build_grid
 from orchestrate.errors import LaunchError
 from orchestrate.executors.limits import BYTES_PER_GIB
 from orchestrate.records import RunRecord
-from orchestrate.runner.saving import RetryingStore
+from orchestrate.runner.saving import Patience, RetryingStore
 from orchestrate.runner.scheduler import (
     MAX_CHUNK_TRIALS,
     Chunks,
@@ -108,7 +108,7 @@ def build(store: Store) -> Build:
             run = RunRecord(**{**vars(RUN), "wall_seconds": seconds})
             store.commit(claim, outcome(spec), run)
         said: list[str] = []
-        patient = RetryingStore(store, launch, 1.0, said.append)
+        patient = RetryingStore(store, launch, Patience(1.0, said.append))
         chunks = StoredChunks(patient, 1.0, slots, length, said.append)
         chunks.look()
         return chunks, said

@@ -115,6 +115,20 @@ def test_claims_are_released_one_by_one_and_end_with_their_launch(db: Database) 
     assert sorted(rows) == [("done", "done"), *[("pending", "released")] * 2]
 
 
+def test_a_launch_that_begins_again_is_one_launch_and_alive(
+    db: Database, open_store: OpenStore
+) -> None:
+    """Its answer was lost, and others have taken it for dead meanwhile."""
+    token = db.store.new_token()
+    launch = db.store.begin_launch(LAUNCH, token)
+    execute(db.url, f"UPDATE launch SET state = 'lost', ended = started WHERE launch_id = {launch}")
+    assert db.store.begin_launch(LAUNCH, token) == launch
+    states = db.rows("SELECT state, ended FROM launch ORDER BY launch_id")
+    assert states == [("running", None)] * 2
+    assert open_store().recover() == 0
+    assert db.rows("SELECT state, ended FROM launch ORDER BY launch_id") == states
+
+
 def test_a_launch_ends_in_a_known_state(db: Database) -> None:
     with pytest.raises(ValueError, match="give done, failed, interrupted, lost"):
         db.store.end_launch(db.launch, "fine")

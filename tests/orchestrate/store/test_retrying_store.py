@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrate.runner.saving import IDEMPOTENT, RetryingStore
+from orchestrate.runner.saving import IDEMPOTENT, Patience, RetryingStore
 from orchestrate.store import InvalidResultError, Store
 from orchestrate.store import StoreUnavailableError as UnavailableError
 from tests.orchestrate.losses import lose
@@ -32,7 +32,7 @@ def said() -> list[str]:
 
 @pytest.fixture
 def patient(db: Database, said: list[str]) -> RetryingStore:
-    return RetryingStore(db.store, db.launch, PATIENCE_SECONDS, said.append)
+    return RetryingStore(db.store, db.launch, Patience(PATIENCE_SECONDS, said.append))
 
 
 @pytest.mark.parametrize("name", IDEMPOTENT)

@@ -193,6 +193,7 @@ def test_a_file_that_is_no_database_any_more_is_damaged(tmp_path: Path, side: st
         ("file/results.db", "cannot be made or opened"),
         ("folder", "is a folder, but a file is expected"),
         ("n" * 300, "cannot be made or opened"),
+        ("pipe", "is a device, a pipe or a socket, but a file is expected"),
     ],
 )
 def test_a_place_where_no_file_can_be_is_a_wrong_request(
@@ -200,8 +201,10 @@ def test_a_place_where_no_file_can_be_is_a_wrong_request(
 ) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
     with pytest.raises(StoreError, match=words) as caught:
         Store.open(f"sqlite:///{tmp_path}/{place}")
+    assert {one.name for one in tmp_path.iterdir()} == {"file", "folder", "pipe"}
     assert not isinstance(caught.value, StoreUnavailableError)
 
 
