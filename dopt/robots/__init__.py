@@ -4,6 +4,7 @@ from dopt.robots.body import Body, Motion
 from dopt.robots.design import Design, Problem
 from dopt.robots.explorer import RobotExplorer
 from dopt.robots.limits import Limits
+from dopt.robots.report import Report
 from dopt.robots.sysid import sequences
 
-__all__ = ["Body", "Design", "Limits", "Motion", "Problem", "RobotExplorer", "sequences"]
+__all__ = ["Body", "Design", "Limits", "Motion", "Problem", "Report", "RobotExplorer", "sequences"]

@@ -217,6 +217,20 @@ class Body:
         result: Array = rows @ self.inertial + model.dof_armature[self.dofs] * motion.accelerations
         return result
 
+    def columns(self, motion: Motion) -> dict[str, Array]:
+        """Return time, q, dq, ddq and tau of each joint, such as ``q_elbow``, each (T,).
+
+        Torques tau are without friction, as by :meth:`torques`.
+        """
+        parts = {"q": motion.positions, "dq": motion.velocities, "ddq": motion.accelerations}
+        parts["tau"] = self.torques(motion)
+        named = {
+            f"{kind}_{joint}": part[:, j]
+            for kind, part in parts.items()
+            for j, joint in enumerate(self.joints)
+        }
+        return {"time": motion.times, **named}
+
     @functools.cached_property
     def _known(self) -> KnownBody:
         return KnownBody(self)

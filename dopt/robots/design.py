@@ -21,6 +21,7 @@ from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Parameter, Unknowns, count_null, relative_errors
+from dopt.robots.report import Report
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine, Spline
 from dopt.types import Array
 
@@ -222,6 +223,17 @@ class Problem:
         touching = body.collisions(motion.positions)
         return f"the bodies {touching[0][1]} and {touching[0][2]} touch" if touching else ""
 
+    def check(self, seed: int = 0) -> Report:
+        """Report which parameters the best of some random multisines identifies, and how well.
+
+        It prints as text: ``print(problem.check())``.
+        """
+        best = multisine(self, np.random.default_rng(whole("seed", seed, 0, 2**63)))
+        report = Report.of(self, best, REFERENCES)
+        if obstacle := self.obstacle(best):
+            report["notes"].append(f"the best multisine breaks limits: {obstacle}")
+        return report
+
     def checked(self, one: Candidate) -> Candidate:
         """Return a candidate, broken only if something stands against it at finer steps."""
         return dataclasses.replace(one, broken=float(bool(self.obstacle(one))))
@@ -255,6 +267,10 @@ class Design:
     @property
     def best(self) -> Candidate:
         return self.candidates[0]
+
+    def report(self) -> Report:
+        """Report the candidates, and what the best one identifies; it prints as text."""
+        return Report.of(self.problem, self.best, REFERENCES).add_design(self)
 
     @classmethod
     def of(
@@ -330,7 +346,9 @@ def multisine(problem: Problem, rng: np.random.Generator) -> Candidate:
 
 
 def _said(one: Candidate) -> str:
-    return f"mean relative error {100.0 * math.exp(np.log(one.errors).mean()):.3g} %"
+    return (
+        f"geometric mean of the relative errors {100.0 * math.exp(np.log(one.errors).mean()):.3g} %"
+    )
 
 
 def improved(

@@ -6,8 +6,9 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,10 +19,8 @@ from orchestrate.program import UsageError, integer, path, positive, tell
 
 if TYPE_CHECKING:
     from dopt.robots.body import Motion
-    from dopt.robots.design import Candidate, Design, Problem
-
-SHOWN = 20
-"""Rows of a list that are printed; --json has all."""
+    from dopt.robots.design import Problem
+    from dopt.robots.report import Report
 
 ROS_STEP = 0.01
 """Least time between two points of a JointTrajectory [s]."""
@@ -91,89 +90,24 @@ def _run(arguments: argparse.Namespace) -> ExitCode:
         noise=arguments.noise,
         rate=arguments.rate,
     )
-    head = {"robot": str(arguments.robot), "joints": list(body.joints)}
-    head |= {"notes": [*body.notes, *limits.notes]}
-    return (_check if arguments.check else _design)(arguments, problem, head)
+    return (_check if arguments.check else _design)(arguments, problem)
 
 
-def _check(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]) -> ExitCode:
+def _check(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
     """Say what the best of some random multisines can and cannot identify."""
-    from dopt.robots.design import multisine
-
-    best = multisine(problem, np.random.default_rng(arguments.seed))
-    document = head | _told(problem, best)
-    if obstacle := problem.obstacle(best):
-        document["notes"].append(f"the best multisine breaks limits: {obstacle}")
-    how = f"by the best of {document['motions']} random multisines of {problem.seconds:g} s"
-    return answer(arguments, document, "\n".join([*_said(document), *_expected(document, how)]))
+    return _answer(arguments, problem.check(arguments.seed))
 
 
-def _told(problem: Problem, best: Candidate) -> dict[str, Any]:
-    """Return what a motion says of the parameters."""
-    from dopt.robots.design import REFERENCES
-    from dopt.robots.parameters import Identifiability
-
-    found = Identifiability.of(problem.unknowns, best.motion(problem.step), problem.rate)
-    return {
-        "motions": REFERENCES,
-        "seconds": problem.seconds,
-        "null": found.null,
-        "weak": found.weak,
-        "parameters": [
-            {
-                "name": one.name,
-                "unit": one.unit,
-                "nominal": one.value,
-                "half_width": 1.96 * float(error) * one.scale,
-                "relative": 1.96 * float(error),
-            }
-            for one, error in zip(problem.requested, best.errors, strict=True)
-        ],
-    }
+def _answer(arguments: argparse.Namespace, report: Report, written: Sequence[str] = ()) -> ExitCode:
+    count = len(report["joints"])
+    head = f"{arguments.robot}: {count} joint{'s' if count > 1 else ''}"
+    document = {"robot": str(arguments.robot), **report}
+    if not arguments.check:
+        document["written"] = list(written)
+    return answer(arguments, document, "\n".join([head, str(report), *written]))
 
 
-def _said(document: dict[str, Any]) -> list[str]:
-    count = len(document["joints"])
-    lines = [f"{document['robot']}: {count} joint{'s' if count > 1 else ''}"]
-    lines += [f"note: {note}" for note in document["notes"]]
-    lines += _listed(document["null"], "combinations that no motion can tell")
-    lines += _listed(document["weak"], "parameters with standard errors above 100 %")
-    return lines
-
-
-def _listed(items: list[str], what: str) -> list[str]:
-    if not items:
-        return [f"no {what}"]
-    more = [f"  and {len(items) - SHOWN} more (--json)"] if len(items) > SHOWN else []
-    return [
-        f"{len(items)} {what if len(items) > 1 else what.replace('s ', ' ', 1)}:",
-        *(f"  {item}" for item in items[:SHOWN]),
-        *more,
-    ]
-
-
-def _expected(document: dict[str, Any], how: str) -> list[str]:
-    """Return the expected intervals, the least certain first; what is not measured ends them."""
-    rows = sorted(document["parameters"], key=lambda row: -row["relative"])
-    known = [row for row in rows if row["relative"] < 1.96 / math.sqrt(2.0)]
-    lines = [
-        f"expected half-widths of 95 % intervals, {how}, if each parameter is known to about its "
-        f"own size before:"
-    ]
-    for row in known[:SHOWN]:
-        percent = f"{100.0 * row['relative']:.3g} %"
-        lines.append(
-            f"  {row['name']:<40} {row['nominal']:>10.4g} ± {row['half_width']:<9.3g} "
-            f"{row['unit']:<12} {percent}"
-        )
-    if len(known) > SHOWN:
-        lines.append(f"  and {len(known) - SHOWN} that are better (--json)")
-    if len(known) < len(rows):
-        lines.append(f"  and {len(rows) - len(known)} of which this says little or nothing")
-    return lines
-
-
-def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any]) -> ExitCode:
+def _design(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
     from dopt.robots.design import Design
 
     for option, target in (("--out", arguments.out), ("--ros", arguments.ros)):
@@ -187,10 +121,6 @@ def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any
         progress=lambda line: tell(sys.stderr, f"{line}\n"),
     )
     motion = design.best.motion(1.0 / arguments.rate)
-    document = head | _told(problem, design.best)
-    document |= {"best": design.best.name, "candidates": _candidates(design), "gap": design.gap}
-    strain = float(problem.strains(motion).max())
-    document["limits"] = problem.limits.shares(motion) | {"torque": strain}
     written = []
     if arguments.out:
         _write_csv(arguments.out, problem, motion)
@@ -200,54 +130,14 @@ def _design(arguments: argparse.Namespace, problem: Problem, head: dict[str, Any
     if arguments.ros:
         _write_ros(arguments.ros, problem, motion)
         written.append(f"JointTrajectory: {arguments.ros}")
-    document["written"] = written
-    lines = [*_said(document), *_table(design), *_taken(document)]
-    lines += _expected(document, f"by {design.best.name}, {problem.seconds:g} s")
-    return answer(arguments, document, "\n".join([*lines, *written]))
-
-
-def _candidates(design: Design) -> list[dict[str, Any]]:
-    reference = design.reference
-    return [
-        {
-            "name": one.name,
-            "share": one.share,
-            "error_by_reference": math.exp(float(np.log(one.errors / reference).mean())),
-            "worst_by_reference": float((one.errors / reference).max()),
-            "within_limits": one.free,
-        }
-        for one in design.candidates
-    ]
-
-
-def _table(design: Design) -> list[str]:
-    head = f"{'motion':<20} {'information':>12} {'errors':>8} {'worst':>8}"
-    lines = [head]
-    for row in _candidates(design):
-        kept = "" if row["within_limits"] else "  breaks limits"
-        lines.append(
-            f"{row['name']:<20} {100.0 * row['share']:>10.1f} % {row['error_by_reference']:>8.2f} "
-            f"{row['worst_by_reference']:>8.2f}{kept}"
-        )
-    lines.append(
-        "information: share of the attainable one for each parameter; errors and worst: standard "
-        "errors by the median of random multisines, their geometric mean and the largest"
-    )
-    return lines
-
-
-def _taken(document: dict[str, Any]) -> list[str]:
-    parts = [f"{kind} {100.0 * share:.0f} %" for kind, share in document["limits"].items()]
-    return [f"of the limits, {document['best']} takes: {', '.join(parts)}; no bodies touch"]
+    return _answer(arguments, design.report(), written)
 
 
 def _write_csv(target: Path, problem: Problem, motion: Motion) -> None:
-    torques = problem.body.torques(motion)
-    names = [f"{kind}_{j}" for kind in ("q", "dq", "ddq", "tau") for j in problem.body.joints]
-    parts = (motion.positions, motion.velocities, motion.accelerations, torques)
-    rows = np.column_stack([motion.times, *parts])
+    columns = problem.body.columns(motion)
     with whole(target) as partial:
-        head = ",".join(["time", *names])
+        rows = np.column_stack(list(columns.values()))
+        head = ",".join(columns)
         np.savetxt(partial, rows, fmt="%.9g", delimiter=",", header=head, comments="")
 
 

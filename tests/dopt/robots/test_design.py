@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,7 @@ def test_the_best_random_motion_is_improved_the_more_the_longer(arm: Body, limit
         for seed, effort, progress in ((1, 3, lines.append), (1, 3, str), (1, 20, str), (2, 3, str))
     )
     assert first.best.name == "spline"
-    assert lines[-1].startswith(f"spline, from {first.candidates[1].name}: mean relative error")
+    assert lines[-1].startswith(f"spline, from {first.candidates[1].name}: ")
     np.testing.assert_array_equal(first.best.numbers, again.best.numbers)
     scores = [problem.score(one.best) for one in (longer, first, other)]
     assert scores[0] < scores[1] != scores[2]
@@ -302,3 +303,27 @@ def test_what_stands_against_every_motion_is_named(tmp_path: Path) -> None:
     assert problem.obstacle(multisine(problem, np.random.default_rng(0))) == (
         "the bodies world and arm touch"
     )
+
+
+def test_reports_print_and_hold_what_json_can(arm: Body, limits: Limits) -> None:
+    problem = Problem(arm, limits, "all", 3.0)
+    seen = problem.check(seed=1)
+    assert json.loads(json.dumps(seen)) == seen
+    assert f"{len(seen['null'])} combinations" in str(seen)
+    assert all(item in str(seen) for item in seen["null"][:20])
+    design = Design.of(Problem(arm, limits, "damping", 3.0), seed=1, effort=2)
+    told = design.report()
+    assert json.loads(json.dumps(told)) == told
+    assert [row["name"] for row in told["candidates"]] == [one.name for one in design.candidates]
+    assert "every combination of the parameters changes the torques" in str(told)
+    assert f"of the limits, {design.best.name} takes" in str(told)
+
+
+def test_columns_of_a_motion_are_named_by_joint(arm: Body, limits: Limits) -> None:
+    design = Design.of(Problem(arm, limits, "damping", 3.0), effort=1)
+    motion = design.best.motion(0.01)
+    columns = arm.columns(motion)
+    assert list(columns)[:2] == ["time", f"q_{arm.joints[0]}"]
+    assert {len(column) for column in columns.values()} == {300}
+    taken = [columns[f"tau_{joint}"] for joint in arm.joints]
+    np.testing.assert_array_equal(np.transpose(taken), arm.torques(motion))
