@@ -334,7 +334,9 @@ def lines(
 
     The units of ``declared`` states, or of the "time", are not doubted.
     """
-    told = "time" in declared or any("Stamps are" in one or " dates:" in one for one in log.notes)
+    told = "time" in declared or any(
+        "Stamps are" in one or ": times count" in one for one in log.notes
+    )
     yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:
         yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
