@@ -121,8 +121,8 @@ def clock_column(
         raise SpecificationError(
             f"a log has the columns {', '.join(table)}, of which {' and '.join(found) or 'none'} "
             f"{'are' if found else 'is'} called time, t or timestamp, but one column of stamps is "
-            f"expected: give its name, or stamps such as table.index, as time, or the seconds "
-            f"between two rows as dt."
+            f"expected: give its name, or stamps such as table.index, as time, or the time "
+            f"between two rows as dt, in seconds."
         )
     return found[0]
 
