@@ -52,6 +52,9 @@ SURE = 0.9
 FAR = 7.5
 """What an input's past leaves open of a row, by its median, above which it jumps there."""
 
+ENOUGH = 20
+"""Rows for each fitted number in which an input moves, from which chance explains less of it."""
+
 ROOM = 1.5
 """Windows side by side for each feature of the state, below which too little is left to tell."""
 
@@ -185,7 +188,7 @@ def rates(log: Log) -> list[bool]:
         return found
     smooth, slopes = (_filtered(longest, weights(p, order)) for order in (0, 1))
     there = np.isfinite(smooth).all(axis=1)
-    for i in range(n):
+    for i in range(n if there.any() else 0):
         for j in range(n):
             if i != j and np.ptp(smooth[there, j]) > 0 and np.ptp(slopes[there, i]) > 0:
                 alike = np.corrcoef(slopes[there, i], smooth[there, j])[0, 1]
@@ -213,6 +216,8 @@ def _best_response(
         return None
     state, motion, lagged = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     x = lagged[:, :, j]
+    if not len(state):
+        return None
     others = [k for k in range(lagged.shape[2]) if k != j and not _alike(lagged[:, 3, [j, k]])]
     features = np.column_stack([state, lagged[:, 3, others]])
     if len(state) < ROOM * (2 * p + 1) * features.shape[1]:
@@ -293,20 +298,26 @@ def _steadiness(x: Vector, motion: Vector) -> float:
 def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
     """Return what the state leaves open of an input, what it adds to its past, and the past.
 
-    Jumps of the input, such as at steps of a set point, may hide what is fed back between them. The
-    last two are of the rows between them where much is.
+    Rows in which the input stays as it is, such as at a limit, tell of no feedback, and its jumps,
+    such as at steps of a set point, may hide what is fed back between them. The last two are of the
+    rows in which it moves, and of these between jumps where much is.
     """
     rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
     if not rows:
         return 1.0, 0.0, 0.0
     now, past, seen = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    if len(now) < 4 * (past.shape[1] + seen.shape[1]):
+    numbers = past.shape[1] + seen.shape[1]
+    if len(now) < 4 * numbers:
         return 1.0, 0.0, 0.0
     left = _left(np.column_stack([past[:, 0], seen]), now)[0]
+    share = left / float(((now - now.mean()) ** 2).sum())
+    moves = now != past[:, 1 + j]
+    if moves.sum() >= ENOUGH * numbers:
+        now, past, seen = now[moves], past[moves], seen[moves]
     usual = _usual(past, now)
     between = _feedback(past[usual], seen[usual], now[usual])
     found = between if between[0] > BETWEEN else _feedback(past, seen, now)
-    return left / float(((now - now.mean()) ** 2).sum()), *found
+    return share, *found
 
 
 def _feedback(past: Array, seen: Array, now: Vector) -> tuple[float, float]:
@@ -528,10 +539,10 @@ def _fast(parts: Sequence[Vector]) -> float:
 
 
 def _rests(values: Vector, noise: float) -> Booleans:
-    """Return where a signal moves by no more than noise, 1 % of its range and 5 % of its most."""
+    """Return where a signal moves by no more than noise, 1 % of its range and 2 % of its most."""
     blocks = [block for block in np.array_split(values, _BLOCKS) if block.size > 1]
     moved = np.array([np.ptp(block) for block in blocks])
-    resting = moved <= max(noise, min(0.01 * np.ptp(values), 0.05 * moved.max(initial=0.0)))
+    resting = moved <= max(noise, min(0.01 * np.ptp(values), 0.02 * moved.max(initial=0.0)))
     return np.concatenate([resting, np.zeros(_BLOCKS - len(blocks), bool)])
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.data.matching import AnalysisError
-from analysis.log_health import FEW, MOST_ROWS, Effect, Health, Signal, examine
+from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
 from dopt.log import TURN, Log, count_text, is_clock
@@ -158,6 +158,9 @@ def _mat(file: Path) -> pd.DataFrame:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
+    with file.open("rb") as opened:
+        if opened.read(len(_HDF5)) == _HDF5:  # of Octave
+            return _hdf5(file)
     try:
         found = loadmat(file, simplify_cells=True)
     except NotImplementedError:  # of version 7.3
@@ -165,6 +168,9 @@ def _mat(file: Path) -> pd.DataFrame:
     except MatReadError as error:
         raise ValueError(error) from error
     return _of_variables(file, {k: v for k, v in found.items() if not k.startswith("__")})
+
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def _hdf5(file: Path) -> pd.DataFrame:
@@ -328,7 +334,9 @@ def lines(
 
     The units of ``declared`` states, or of the "time", are not doubted.
     """
-    told = "time" in declared or any("Stamps are" in one or " dates:" in one for one in log.notes)
+    told = "time" in declared or any(
+        "Stamps are" in one or ": times count" in one for one in log.notes
+    )
     yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:
         yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
@@ -343,7 +351,8 @@ def lines(
     if health.effects and health.irregular > UNEVEN:
         yield "effects of the inputs: as if all steps were of the median length"
     unseen = {*log.inputs} - {effect.input for effect in health.effects}
-    yield from (f"{name}: constant, or too few rows to see its effect" for name in sorted(unseen))
+    few = "constant, or too few rows in a row that have all states to see its effect"
+    yield from (f"{name}: {few}" for name in sorted(unseen))
     yield from _rest(log, health)
     if log.n_rows > MOST_ROWS:
         yield f"effects of the inputs: of the first {MOST_ROWS:,} rows"
@@ -377,7 +386,7 @@ def _signal(one: Signal) -> str:
     if math.isnan(one.quantum):
         return f"{text}, no steps"
     turn = TURN / one.quantum
-    whole = abs(turn - round(turn)) < 1e-3 * max(1.0, turn / 1000) and turn > 50
+    whole = abs(turn - round(turn)) < min(1e-3 * max(1.0, turn / 1000), 0.05) and turn > 50
     return f"{text}, steps of {one.quantum:.6g}{f' ({round(turn):,} a turn)' * whole}"
 
 
@@ -454,7 +463,8 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
             f"what its own past leaves open"
         )
     else:
-        yield f"{effect.input}: open loop, as far as can be seen"
+        alone = ": its own past tells all of it" * (effect.predicted > PREDICTED)
+        yield f"{effect.input}: open loop, as far as can be seen{alone}"
 
 
 def _rest(log: Log, health: Health) -> Iterator[str]:

@@ -121,7 +121,8 @@ def clock_column(
         raise SpecificationError(
             f"a log has the columns {', '.join(table)}, of which {' and '.join(found) or 'none'} "
             f"{'are' if found else 'is'} called time, t or timestamp, but one column of stamps is "
-            f"expected: give its name as time, or the time between two rows as dt, in seconds."
+            f"expected: give its name, or stamps such as table.index, as time, or the time "
+            f"between two rows as dt, in seconds."
         )
     return found[0]
 
@@ -231,12 +232,11 @@ def stamps_of(
             f"rows is expected: correct it."
         )
     values = _dates(values)
-    if values.dtype.kind == "M":
-        there = ~np.isnat(values)
-        elapsed = (values - values[there][:1]) if there.any() else values - values
-        notes.append(f"Column {name!r} holds dates: times count from the first of them.")
-        seconds: Array = elapsed.astype("timedelta64[ns]").astype(np.float64) * 1e-9
-        seconds[~there] = np.nan
+    if values.dtype.kind in "mM":
+        elapsed = values - values[np.argmin(np.isnat(values))]
+        kind = "dates" if values.dtype.kind == "M" else "spans of time"
+        notes.append(f"Column {name!r} holds {kind}: times count from the first of them.")
+        seconds: Array = elapsed / np.timedelta64(1, "ns") * 1e-9
         return seconds
     _check_resolution(name, values)
     factor = 1.0 if unit == 1.0 else _factor(name, unit, SECONDS)
@@ -251,7 +251,7 @@ def stamps_of(
 
 
 def _dates(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return texts that are dates as datetime64 in UTC, anything else as it is."""
+    """Return dates, texts of them in UTC, and spans of time in ns, anything else as it is."""
     if values.dtype.kind in "OUST":
         texts = [str(one).strip() for one in values]
         found = [_DATE.fullmatch(one) for one in texts]
@@ -261,7 +261,7 @@ def _dates(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
                 dates = [_utc(one[1], one[2]) if one else "NaT" for one in found]
                 return np.array(dates, "datetime64[ns]")
         return values
-    return values.astype("datetime64[ns]") if values.dtype.kind == "M" else values
+    return values.astype(f"{kind}8[ns]") if (kind := values.dtype.kind) in "mM" else values
 
 
 def _utc(date: str, offset: str | None) -> np.datetime64:
@@ -368,7 +368,7 @@ class Log:
         Names of the n measured states and the m inputs; with the names of their columns, where
         these differ.
     time : str or array, optional
-        Column of the stamps, or the stamps: numbers, or dates and times. Without it, a column
+        Column of the stamps, or the stamps: numbers, dates or spans of time. Without it, a column
         called time, t or timestamp is taken. Times count from the first stamp.
     dt : float, optional
         Time between two rows [s] of a table without stamps.
@@ -420,7 +420,7 @@ class Log:
         for name in angles:
             if name not in self.states:
                 raise unknown_name("measured state in 'angles' of a log", name, self.states)
-        taken = {column for group in named for column in group.values() if column != time}
+        taken = {column for group in named for column in group.values()}
         clock = clock_column(table, taken, time, dt, notes)
         unit_of = _units_of(units or {}, named, clock)
         stamps = stamps_of(table, clock, time, dt, unit_of.get(clock or "time", 1.0), notes)

@@ -159,10 +159,10 @@ class Signs:
         self._parameters: Array | None = None  # at the beginning of the block
         self._still = 0  # blocks in a row that left them as they were
         self._start = 0  # first of the steps that followed each other
-        self._steps: list[tuple[int, float, Any, Array]] = []  # start, time, measurement, waiting
-        self._models: list[Array] = []  # parameters at the beginning of each block of them
+        # of the last steps: start, time, measurement, waiting
+        self._steps = deque[tuple[int, float, Any, Array]](maxlen=max(TESTED, RUNS * AHEAD))
+        self._models: list[Array] = []  # parameters at the beginning of each block of a test
         self._rows: list[tuple[Array, ...]] = []  # of the next test
-        self._starts: list[int] = []  # of the last steps
         self._tests: deque[Iterator[None]] = deque()  # that are not done, part by part
         self._told: set[str] = set()
 
@@ -180,7 +180,6 @@ class Signs:
             if limits.enforced:
                 self._say("beyond", state.excess[done - 1], done)
         self._steps.append((self._start, seconds, event["learn"], state.waiting))
-        self._starts.append(self._start)
         if done % BLOCK == 0:
             self._end_block(state)
         if done % TRIED == 0:
@@ -225,12 +224,11 @@ class Signs:
             self._say("unmoved", learner.name)
         tested = 0 < (state.done - FIRST) % EVERY <= 2 * TESTED
         if not tested or before is None:
-            self._steps = []
             return
         self._models.append(before)
-        if len(self._steps) == TESTED:
-            self._begin(self._test_inputs(state, self._steps, self._models))
-            self._steps, self._models = [], []
+        if len(self._models) == TESTED // BLOCK:
+            self._begin(self._test_inputs(state, [*self._steps][-TESTED:], self._models))
+            self._models = []
 
     def _begin(self, test: Iterator[None]) -> None:
         """Begin a test, which copies what it needs of the exploration as it is now."""
@@ -240,7 +238,7 @@ class Signs:
     def _compare_runs(self, state: Exploration) -> Iterator[None]:
         """Count where the learned model predicts the last states worse than without it."""
         found, predicted, steps = scaled(state.system), self._spec.model.predict, state.steps
-        starts, self._starts = self._starts[-RUNS * AHEAD :], []
+        starts = [start for start, *_ in self._steps][-RUNS * AHEAD :]
         first, last = state.done - len(starts), len(starts) - 1
         each = range(0, last + 2 - AHEAD, AHEAD)
         at = [t for t in each if starts[min(t + AHEAD, last)] <= first + t]

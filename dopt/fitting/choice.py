@@ -412,10 +412,10 @@ class _Search:
         q, simulator = self.model.q, Simulator(self.model, self.data)
         out, windows = np.zeros((self.n + 1, q, q)), self.windows.where(self.free)
         weights, owners = np.full(len(windows.rows), self.s**-2), self.owners[self.free] + 1
-        linear = simulator.linear(self.p, windows, weights, scores=True, owners=owners)
+        linear = simulator.linear(self.p, windows, weights, owners=owners)
         out[: len(linear.parts)] = linear.parts
         slopes = np.zeros((self.n + 1, q))
-        np.add.at(slopes, owners, linear.scores)  # type: ignore[arg-type]  # asked for
+        np.add.at(slopes, owners, linear.scores)
         slopes[0] -= self.p - self.model.prior
         for i in np.flatnonzero(~self.free):
             (first, last), start = self.windows.rows[i], self.windows.starts[i]

@@ -186,7 +186,7 @@ def fit(
     chosen = work.finish(*network) if network else physics
     work.check_steps(chosen)
     other = {"zero": "linear", "linear": "cubic"}.get(hold)
-    if other and physics.model.names:
+    if other and physics.model.n_named:
         work.check_hold(physics, other, data_of(plant, runs, other))
     held_out = work.held_out()
     return Fitted(plant, hold, work.data, chosen, physics, held_out, work.selection(seed), tests)
@@ -477,10 +477,7 @@ class _Selection:
         found = solve(simulator, found.windows, found.p, s, scale=found.scale)
         weights = 1.0 / (1.0 + found.squares / found.scale)
         owners = None if model.width else np.arange(len(weights))
-        linear = simulator.linear(
-            found.p, found.windows, weights / s**2, scores=True, owners=owners
-        )
-        assert linear.scores is not None
+        linear = simulator.linear(found.p, found.windows, weights / s**2, owners=owners)
         inverse = np.linalg.inv(linear.normal + np.eye(model.q))
         influence = linear.scores @ inverse
         if not model.width:
@@ -509,12 +506,16 @@ class _Selection:
             )
 
     def check_hold(self, found: Estimate, other: str, data: Data) -> None:
-        """Note it where constants are others if inputs are interpolated in another way."""
+        """Note it where constants are others if inputs are interpolated in another way.
+
+        A delay is: lines come half a sample before inputs that are held.
+        """
         (model, before, s, covariance), windows = found, found.solution.windows
         windows = windows._replace(rows=same_rows(windows.rows, self.data, data))
         simulator = Simulator(model, data._replace(deviations=self.data.deviations))
         after = solve(simulator, windows, before.p, s, most=8, scale=before.scale)
         moved = np.abs(after.p - before.p) / np.sqrt(np.diag(covariance))
+        moved = moved[: model.n_named]
         most = int(np.argmax(moved))
         fall = before.cost(model, s) - after.cost(model, s)
         if moved[most] > 1.0 and fall > SURELY:

@@ -277,7 +277,7 @@ class Model:
             width=width,
             free_delay="delay" in free,
             free_lag="lag" in free,
-            longest_step=longest_step or plant.dt,
+            longest_step=float(longest_step or plant.dt),
             limits=limits,
         )
         self.sizes = layout.sizes
@@ -329,7 +329,7 @@ class Model:
             time = getattr(self.plant, name)
             if name in self._times:
                 z = float(p[self._times[name]])
-                numbers[i], numbers[2 + i] = time.at(z), time.slope(z)
+                numbers[i], numbers[2 + i] = float(time.at(z)), float(time.slope(z))
         weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
         sizes = np.ascontiguousarray(self.sizes)
         return Values(constants, slopes, weights, sizes, *numbers)

@@ -28,7 +28,15 @@ from scipy.linalg import blas, cho_factor, cho_solve
 
 from dopt.fitting import simulation
 from dopt.fitting.model import Model, measured_names
-from dopt.fitting.simulation import DERIVATIVES, Data, Structure, Values
+from dopt.fitting.simulation import (
+    DERIVATIVES,
+    Data,
+    Problem,
+    Projected,
+    Structure,
+    Values,
+    Work,
+)
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
@@ -58,11 +66,10 @@ class Linear(NamedTuple):
 
     normal: Array  # (q, q) Σ RᵀR of the windows, weighted
     slope: Array  # (q,) Σ Rᵀe
-    squares: Array  # (k,) ‖e‖²
     T: Array  # (k, d, d)
     C: Array  # (k, d, q)
     g: Array  # (k, d)
-    scores: Array | None  # (k, q) Rᵀe of each window
+    scores: Array  # (k, q) Rᵀe of each window
     parts: Array  # (n, q, q) Σ RᵀR of the windows of each owner
 
 
@@ -97,22 +104,13 @@ class Simulator:
         self.model, self.data = model, data
         self.tolerance = simulation.TOGETHER * float(np.median(np.abs(np.diff(data.time))))
         self._dull, self._sharp = model.work(0), model.work(model.q + model.d)
-        self._starts, self._nothing = model.work(model.d), np.empty((0, model.d, 0))
+        self._starts = model.work(model.d)
         self.channels = len(model.structure.measured)
         self._times: tuple[float, ...] = ()
         self._filtered: tuple[Array, Array]
 
-    def filtered(self, values: Values) -> tuple[Array, Array]:
-        """Return what acts of all inputs; the same as before while delay and lag are the same."""
-        times = (values.delay, values.lag, values.lag_slope)
-        if times != self._times:
-            N, m = self.data.inputs.shape
-            v, dv = np.empty((N, m)), np.empty((N, m, 2))
-            call(simulation.filter_inputs, self.data, values, self.tolerance, self._dull, v, dv)
-            self._times, self._filtered = times, (v, dv)
-        return self._filtered
-
     def squares(self, p: Array, windows: Windows) -> Array:
+        """Return ‖e‖² of windows, (k,), inf where one leaves the limit."""
         return self._simulate(p, windows, np.empty((windows.longest, self.model.d)))
 
     def states(self, p: Array, first: int, last: int, start: Array) -> Array:
@@ -140,15 +138,24 @@ class Simulator:
         self, p: Array, windows: Windows, states: Array, slopes: Array | None = None
     ) -> Array:
         """Return ‖e‖² of windows; write the states, and S where wanted, of the last one."""
-        values, d, squares = self.model.values(p), self.model.d, np.empty(len(windows.rows))
-        work, S = (self._dull, self._nothing) if slopes is None else (self._sharp, slopes)
-        call(
-            *(simulation.simulate, self.model.structure, values, self.data, *windows, squares),
-            *(*self.filtered(values), self.tolerance, work, slopes is not None, states, S),
-            *(np.empty(shape) for shape in ((0, d), (0, 0), 0, (0, d, d), (0, d, 0), (0, d))),
-            squares,
-        )
+        d, k = self.model.d, len(windows.rows)
+        work, S = (self._dull, np.empty((0, d, 0))) if slopes is None else (self._sharp, slopes)
+        problem, squares = self._problem(self.model.values(p), work, states, S), np.empty(k)
+        shapes = ((0, d), (0, 0), 0, (0, d, d), (0, d, 0), (0, d))
+        nothing = Projected(*(np.empty(shape) for shape in shapes))
+        call(simulation.simulate, problem, *windows, squares, nothing, squares)
         return squares
+
+    def _problem(self, values: Values, work: Work, states: Array, slopes: Array) -> Problem:
+        """Return what windows are simulated with at some values."""
+        times = (values.delay, values.lag, values.lag_slope)
+        if times != self._times:
+            N, m = self.data.inputs.shape
+            v, dv = np.empty((N, m)), np.empty((N, m, 2))
+            call(simulation.filter_inputs, self.data, values, self.tolerance, self._dull, v, dv)
+            self._times, self._filtered = times, (v, dv)
+        known = self.model.structure, values, self.data, *self._filtered, self.tolerance
+        return Problem(*known, work, states, slopes)
 
     def settled(self, p: Array, windows: Windows, steps: int = 8) -> Windows:
         """Return the windows with the initial states that fit them best at p."""
@@ -174,7 +181,6 @@ class Simulator:
         windows: Windows,
         weights: Array,
         *,
-        scores: bool = False,
         starts_only: bool = False,
         owners: Integers | None = None,
     ) -> Linear:
@@ -183,40 +189,35 @@ class Simulator:
         With ``starts_only`` it is linearised by the initial states alone, q = 0. With the number of
         the owner of each window, its part of the sum is returned as well.
         """
-        model, data, d = self.model, self.data, self.model.d
+        model, d = self.model, self.model.d
         q, work = (0, self._starts) if starts_only else (model.q, self._sharp)
-        values, k = model.values(p), len(windows.rows)
-        v, dv = self.filtered(values)
+        k, longest = len(windows.rows), windows.longest
+        room = np.empty((longest, d)), np.empty((longest, d, q + d))
+        problem = self._problem(model.values(p), work, *room)
         normal, slope = np.zeros((q, q), order="F"), np.zeros(q)
-        squares = np.empty(k)
-        T, C, g = np.empty((k, d, d)), np.empty((k, d, q)), np.empty((k, d))
-        each = np.zeros((k, q)) if scores else None
+        T, C, g = np.zeros((k, d, d)), np.zeros((k, d, q)), np.zeros((k, d))
+        scores = np.zeros((k, q))
         parts = np.zeros((0 if owners is None else int(np.max(owners, initial=-1)) + 1, q, q))
-        roots = np.sqrt(weights)
+        roots, squares = np.sqrt(weights), np.empty(k)
         sizes = (windows.rows[:, 1] - windows.rows[:, 0] + 1) * self.channels
-        states, Q = np.empty((windows.longest, d)), np.empty((windows.longest * self.channels, d))
-        slopes = np.empty((windows.longest, d, q + d))
+        Q = np.empty((longest * self.channels, d))
         for first, last in _batches(sizes):
-            n = int(sizes[first:last].sum())
-            R, e = np.empty((n, q)), np.empty(n)
-            part = slice(first, last)
-            call(
-                *(simulation.simulate, model.structure, values, data, windows.rows[part]),
-                *(windows.starts[part], roots[part], v, dv, self.tolerance, work, True),
-                *(states, slopes, Q, R, e, T[part], C[part], g[part], squares[part]),
-            )
+            part, n = slice(first, last), int(sizes[first:last].sum())
+            R, e = np.zeros((n, q)), np.zeros(n)
+            into = Projected(Q, R, e, T[part], C[part], g[part])
+            some = windows.rows[part], windows.starts[part], roots[part]
+            call(simulation.simulate, problem, *some, into, squares[part])
             if q:
                 normal = blas.dsyrk(1.0, R.T, beta=1.0, c=normal, overwrite_c=True)
                 slope += e @ R
             ends = np.concatenate([[0], np.cumsum(sizes[part])])
-            for i in range(last - first if scores or owners is not None else 0):
+            for i in range(last - first if q else 0):
                 own = slice(ends[i], ends[i + 1])
-                if each is not None:
-                    each[first + i] = e[own] @ R[own]
+                scores[first + i] = e[own] @ R[own]
                 if owners is not None:
                     parts[owners[first + i]] += R[own].T @ R[own]
         normal = np.triu(normal) + np.triu(normal, 1).T
-        return Linear(normal, slope, squares, T, C, g, each, parts)
+        return Linear(normal, slope, T, C, g, scores, parts)
 
 
 def _batches(sizes: Integers) -> list[tuple[int, int]]:

@@ -158,6 +158,31 @@ def work_for(d: int, m: int, columns: int, unknown: int, p: int, w: int) -> Work
     return Work._make([*vectors, *of_inputs, *of_stages, *of_steps, *of_network])
 
 
+class Problem(NamedTuple):
+    """What windows are simulated with, and room for one of them."""
+
+    structure: Structure
+    values: Values
+    data: Data
+    filtered: Matrix  # (N, m) what acts of the inputs
+    dfiltered: types.Array  # (N, m, 2) its derivatives by delay and lag
+    tolerance: float  # [s] within which a switch of the input and a sample are at the same time
+    work: Work
+    states: Matrix  # (rows, d) of the last window
+    slopes: types.Array  # (rows, d, q + d) S at each row; none where they are not wanted
+
+
+class Projected(NamedTuple):
+    """Linearised windows, from which what their initial states explain is taken out; 0 at first."""
+
+    Q: Matrix  # (rows n, d) of the last window
+    R: Matrix  # (rows n, q) of all windows, one below the other, (I - Q Qᵀ) R
+    e: Vector  # (rows n,) (I - Q Qᵀ) e
+    T: types.Array  # (k, d, d)
+    C: types.Array  # (k, d, q) Qᵀ R
+    g: Matrix  # (k, d) Qᵀ e
+
+
 @_compiled
 def _dot(a: Vector, b: Vector) -> float:
     """Return the sum of products, of as many as b has: four sums, so that none waits for one."""
@@ -429,30 +454,19 @@ def filter_inputs(
 
 
 @_compiled
-def run(
-    structure: Structure,
-    values: Values,
-    data: Data,
-    first: int,
-    last: int,
-    start: Vector,
-    filtered: Matrix,
-    dfiltered: types.Array,
-    tolerance: float,
-    work: Work,
-    sensitive: bool,
-    states: Matrix,
-    slopes: types.Array,
-) -> bool:
+def run(problem: Problem, first: int, last: int, start: Vector) -> bool:
     """Simulate rows ``first`` to ``last`` from a state; tell whether all stayed within the limit.
 
-    Written are the states, (rows, d), and S at each row, (rows, d, q + d), where wanted.
+    Written are the states, and S at each row where it is wanted.
     """
+    structure, values, data, work = problem.structure, problem.values, problem.data, problem.work
+    states, slopes, sensitive = problem.states, problem.slopes, problem.slopes.shape[0] > 0
     d, n = work.S.shape
     m = data.inputs.shape[1]
     for i in range(m):
-        work.now[i] = filtered[first, i]
-        work.dnow[i, 0], work.dnow[i, 1] = dfiltered[first, i, 0], dfiltered[first, i, 1]
+        work.now[i] = problem.filtered[first, i]
+        for j in range(2):
+            work.dnow[i, j] = problem.dfiltered[first, i, j]
     for i in range(d):
         work.x[i] = start[i]
         states[0, i] = start[i]
@@ -461,12 +475,12 @@ def run(
         for i in range(d):
             work.S[i, n - d + i] = 1.0
         _copy(work.S, slopes[0])
-    j = acting_input(data, first, values.delay, tolerance)
+    j = acting_input(data, first, values.delay, problem.tolerance)
     for row in range(first, last):
         t, end = data.time[row], data.time[row + 1]
         while True:
             switch = data.time[j + 1] + values.delay if j < data.lasts[row] else np.inf
-            if switch > end + tolerance:
+            if switch > end + problem.tolerance:
                 switch = np.inf
             to = min(switch, end)
             if to > t:
@@ -486,46 +500,24 @@ def run(
 
 
 @_compiled
-def write_window(
-    structure: Structure,
-    data: Data,
-    first: int,
-    rows: int,
-    q: int,
-    weight: float,
-    states: Matrix,
-    slopes: types.Array,
-    R: Matrix,
-    e: Vector,
-    Q: Matrix,
-    T: Matrix,
-    C: Matrix,
-    g: Vector,
-) -> float:
-    """Write the rows (I - Q Qᵀ) R and (I - Q Qᵀ) e of one window, times its weight.
-
-    Also written are T, C = Qᵀ R and g = Qᵀ e; ‖e‖² without the weight is returned.
-    """
-    n, d = structure.measured.shape[0], states.shape[1]
-    total, at = 0.0, 0
-    for k in range(rows):
+def write_window(problem: Problem, first: int, last: int, weight: float, into: Projected) -> None:
+    """Write one window that was simulated, times its weight; ``into`` has its part alone."""
+    data, states, slopes = problem.data, problem.states, problem.slopes
+    Q, R, e, T, C, g = into.Q, into.R, into.e, into.T, into.C, into.g
+    n, d, q, at = data.measured.shape[1], states.shape[1], R.shape[1], 0
+    for k in range(last - first + 1):
         for c in range(n):
-            state, size = structure.measured[c], 1.0 / data.deviations[c]
+            state, size = problem.structure.measured[c], 1.0 / data.deviations[c]
             seen = data.measured[first + k, c]
             if math.isnan(seen):
-                R[at, :] = 0.0
                 Q[at, :] = 0.0
-                e[at] = 0.0
             else:
                 for i in range(q):
                     R[at, i] = slopes[k, state, i] * size * weight
                 for i in range(d):
                     Q[at, i] = slopes[k, state, q + i] * size * weight
-                error = (seen - states[k, state]) * size
-                total += error * error
-                e[at] = error * weight
+                e[at] = (seen - states[k, state]) * size * weight
             at += 1
-    T[:] = 0.0
     for i in range(d):
         before = 0.0
         for a in range(at):
@@ -547,9 +539,7 @@ def write_window(
         T[i, i] = math.sqrt(after)
         for a in range(at):
             Q[a, i] /= T[i, i]
-    C[:] = 0.0
     for i in range(d):
-        g[i] = 0.0
         for a in range(at):
             share = Q[a, i]
             g[i] += share * e[a]
@@ -560,99 +550,47 @@ def write_window(
             e[a] -= share * g[i]
             for c in range(q):
                 R[a, c] -= share * C[i, c]
-    return total
 
 
 @_compiled
-def _squares(structure: Structure, data: Data, first: int, rows: int, states: Matrix) -> float:
-    """Return ‖e‖² of a window."""
-    total = 0.0
-    for k in range(rows):
-        for c in range(structure.measured.shape[0]):
+def squares_of(problem: Problem, first: int, last: int) -> float:
+    """Return ‖e‖² of a window that was simulated."""
+    data, total = problem.data, 0.0
+    for k in range(last - first + 1):
+        for c in range(data.measured.shape[1]):
             seen = data.measured[first + k, c]
             if not math.isnan(seen):
-                error = (seen - states[k, structure.measured[c]]) / data.deviations[c]
+                state = problem.structure.measured[c]
+                error = (seen - problem.states[k, state]) / data.deviations[c]
                 total += error * error
     return total
 
 
 @_compiled
 def simulate(
-    structure: Structure,
-    values: Values,
-    data: Data,
+    problem: Problem,
     windows: types.Array,
     starts: Matrix,
     weights: Vector,
-    filtered: Matrix,
-    dfiltered: types.Array,
-    tolerance: float,
-    work: Work,
-    sensitive: bool,
-    states: Matrix,
-    slopes: types.Array,
-    Q: Matrix,
-    R: Matrix,
-    e: Vector,
-    T: types.Array,
-    C: types.Array,
-    g: Matrix,
+    into: Projected,
     squares: Vector,
 ) -> None:
     """Simulate windows, (k, 2) first and last rows, from their initial states, (k, d).
 
-    ``squares`` are ‖e‖² of the windows, inf where one leaves the limit. ``states`` and ``slopes``
-    belong to the last window, and have room for the longest. Where R has rows, the windows write
-    theirs one below the other, 0 where one leaves the limit; Q, (rows n, d), is room.
+    Where slopes are wanted and R has rows, the windows are linearised, and 0 is left where one
+    leaves the limit. Otherwise ``squares``, (k,), are ‖e‖², inf where one does.
 
     All that simulates is compiled in this one function.
     """
-    d, n = work.S.shape
-    q, channels = n - d, structure.measured.shape[0]
-    at = 0
+    n, at = problem.data.measured.shape[1], 0
     for k in range(windows.shape[0]):
         first, last = windows[k, 0], windows[k, 1]
-        rows = last - first + 1
-        here = slice(at, at + rows * channels)
-        inside = run(
-            structure,
-            values,
-            data,
-            first,
-            last,
-            starts[k],
-            filtered,
-            dfiltered,
-            tolerance,
-            work,
-            sensitive,
-            states,
-            slopes,
-        )
-        if R.shape[0] == 0:
-            squares[k] = _squares(structure, data, first, rows, states) if inside else np.inf
-        elif inside:
-            squares[k] = write_window(
-                structure,
-                data,
-                first,
-                rows,
-                q,
-                weights[k],
-                states,
-                slopes,
-                R[here],
-                e[here],
-                Q,
-                T[k],
-                C[k],
-                g[k],
-            )
-        else:
-            squares[k] = np.inf
-            R[here] = 0.0
-            e[here] = 0.0
-            T[k] = 0.0
-            C[k] = 0.0
-            g[k] = 0.0
-        at += rows * channels
+        inside = run(problem, first, last, starts[k])
+        if into.R.shape[0] == 0:
+            squares[k] = squares_of(problem, first, last) if inside else np.inf
+            continue
+        end = at + (last - first + 1) * n
+        if inside:
+            own = Projected(into.Q, into.R[at:end], into.e[at:end], into.T[k], into.C[k], into.g[k])
+            write_window(problem, first, last, weights[k], own)
+        at = end

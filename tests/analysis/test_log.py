@@ -100,6 +100,14 @@ def test_a_shaft_that_turns_on_does_not_rest() -> None:
     assert not rests.any()
 
 
+def test_what_turns_slowly_does_not_rest() -> None:
+    """A twentieth of the fastest speed was taken for rest."""
+    speed = np.repeat([8.0, 0.3], 1000)
+    turned = np.round(np.cumsum(speed) * DT / 1e-3) * 1e-3
+    log = Log({"th": turned, "u": speed}, states=["th"], inputs=["u"], dt=DT)
+    assert not examine(log).resting.any()
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_an_input_without_effect_is_said_to_explain_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -139,6 +147,33 @@ def test_feedback_is_found_although_a_signal_or_a_set_point_is_added(
     effect = one_effect(np.array(seen[1:]), np.array(u))
     assert effect.closed_loop
     assert not effect.explains_nothing
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_feedback_is_found_of_an_input_that_stays_at_its_limits(seed: int, gain: float) -> None:
+    """The rows at the limits, which the past tells, hid the speed that is fed back in between."""
+    rng = np.random.default_rng(seed)
+    signal = np.repeat(rng.uniform(-3, 3, 100), 40)
+    angle, speed, seen, u = 0.0, 0.0, [], []
+    for wanted in signal:
+        seen.append(round(angle / 1e-3) * 1e-3)
+        u.append(float(np.clip(wanted - 0.03 * gain * speed, -1.0, 1.0)))
+        speed += DT * (40 * u[-1] - speed)
+        angle += DT * speed
+    assert np.mean(np.diff(u) == 0) > 0.3
+    assert one_effect(np.array(seen), np.array(u)).closed_loop == bool(gain)
+
+
+@pytest.mark.parametrize("slower", [2, 3, 10])
+def test_a_slow_sensor_beside_a_fast_one_is_no_defect(slower: int) -> None:
+    """Where no two rows that follow each other have all states, no effect is judged."""
+    rng, t = np.random.default_rng(0), np.arange(2000) * DT
+    u, other = held(rng, 2000), smooth(rng, 2000)
+    slow = np.where(np.arange(2000) % slower, np.nan, motor(u))
+    text = report({"t": t, "th": slow, "volt": 12 - 0.1 * t, "u1": u, "u2": other})
+    for name in ("u1", "u2"):
+        assert f"{name}: constant, or too few rows in a row that have all states" in text
 
 
 def test_gaps_and_missing_values_do_no_harm() -> None:
@@ -259,6 +294,14 @@ def test_columns_that_are_named_like_inputs_are_and_flags_are_not_states() -> No
         log_of(pd.DataFrame({"th": t, "u": t}))
 
 
+@pytest.mark.parametrize("digits", range(3, 8))
+def test_rounding_to_decimals_is_no_encoder(digits: int) -> None:
+    """An input with six decimals had 6,283,185 steps a turn."""
+    rng, t = np.random.default_rng(0), np.arange(3000) * DT
+    u = np.round(smooth(rng, 3000), digits)
+    assert "a turn)" not in report({"t": t, "th": motor(u, step=1e-3), "u": u})
+
+
 # Files
 
 
@@ -302,6 +345,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "scope.mat": lambda path: savemat(path, {"run": scope()}),
     "run.h5": write_hdf5,
     "new.mat": write_hdf5,
+    "octave.mat": write_hdf5,
     "compound.h5": write_compound,
 }
 

@@ -96,6 +96,8 @@ def test_the_input_is_not_shifted_and_nothing_is_resampled() -> None:
         (T + 1.7e9, {}),
         (np.datetime64("2026-01-01") + (T * 1e6).round().astype("timedelta64[us]"), {}),
         (pd.date_range("2026-01-01", periods=N, freq="10ms", tz="Europe/Paris"), {}),
+        (pd.to_timedelta(T, "s"), {}),
+        (pd.Index(T), {}),
         ([f"2026-01-01 00:00:0{k // 100}.{k % 100:02d}" for k in range(N)], {}),
         ([f"2026-01-01T00:00:0{k // 100},{k % 100:02d}+01:00" for k in range(N)], {}),
         ([f"2026-01-01 00:00:0{k // 100}.{k % 100:02d} Z" for k in range(N)], {}),
@@ -104,8 +106,14 @@ def test_the_input_is_not_shifted_and_nothing_is_resampled() -> None:
     ],
 )
 def test_stamps_of_every_kind_are_seconds_from_the_first(stamps: Any, options: Any) -> None:
-    found = log(pd.DataFrame(table(t=stamps)), **options)
+    """In a column, or given apart, as of the index of a table, which ended in an error of numpy."""
+    whole = pd.DataFrame(table(t=stamps))
+    found = log(whole, **options)
     np.testing.assert_allclose(found.pieces[0].time, T, atol=3e-7)
+    [unit] = options.get("units", {"t": 1.0}).values()
+    for apart in (stamps, whole.t, whole.set_index("t").index):
+        found = log(whole.drop(columns="t"), time=apart, units={"time": unit})
+        np.testing.assert_allclose(found.pieces[0].time, T, atol=3e-7)
 
 
 def test_dates_may_be_missing_and_change_their_offset() -> None:

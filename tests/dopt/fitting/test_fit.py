@@ -482,6 +482,27 @@ def test_what_a_smooth_input_does_between_rows_is_said(hold: str, better: str) -
     assert (f"hold='{better}' fits better" in found.report()) == bool(better)
 
 
+def test_inputs_that_are_held_are_not_doubted_for_the_delay() -> None:
+    """Lines come half a sample early, and fit better where the stamps of a logger come late."""
+    table, names = run(0), ("gain", "damping", "gravity")
+    late = np.random.default_rng(0).uniform(0, 0.002, len(table))
+    known = {**declared().constants, **dict(zip(names, TRUE, strict=False))}
+    plant = declared(constants=known)
+    found = dopt.fit(plant, table.assign(time=table.time + late), width=0, window=0.6)
+    assert "fits better" not in found.report()
+
+
+def test_whole_numbers_need_no_other_machine_code() -> None:
+    """A spread of 1 in place of 1.0 compiled all that simulates again, for a minute."""
+    kinds = []
+    for one, tenth in ((1, 0), (1.0, 0.0)):
+        plant = pendulum(delay=dopt.unknown(tenth, spread=one), lag=dopt.unknown(one), dt=one)
+        model = Model(plant)
+        parts = model.values(model.prior), model.structure
+        kinds.append([str(problem._kind(part)) for part in parts])
+    assert kinds[0] == kinds[1]
+
+
 def test_units_of_a_state_do_not_matter() -> None:
     table, results = run(6, 600), []
     for unit in (1.0, 8.0, 1000.0):
