@@ -22,7 +22,7 @@ from dopt.robots.body import Body, Motion
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Parameter, Unknowns, count_null, relative_errors
 from dopt.robots.report import Report
-from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine, Spline
+from dopt.robots.trajectories import KNOT, ROOM, Family, Fourier, Ladder, Multisine, Spline
 from dopt.types import Array
 
 COARSE = 0.04
@@ -42,6 +42,9 @@ DRAWN = 24
 
 EFFORT = 40
 """Splines that are tried unless told otherwise."""
+
+KNOTS = (KNOT, KNOT / 2.0, KNOT / 4.0)
+"""Times between the knots of splines that are tried [s], until one is best."""
 
 RADIUS, WIDEST, NARROWEST = 0.1, 0.3, 0.002
 """Share of the ranges of position by which a spline first changes; the most, and the least."""
@@ -357,13 +360,27 @@ def improved(
     effort: int,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Candidate:
-    """Return the best spline of some, the first of them near a motion.
+    """Return the best spline of some, which begin near a motion.
+
+    Its knots come closer until it is better than the motion that it begins from: one with few knots
+    cannot follow fast lines.
+    """
+    for knot in KNOTS:
+        spline = Spline(problem.limits, problem.seconds, knot)
+        best = _ascended(problem, spline, begun, effort)
+        progress(f"{spline.name}, from {begun.name}, {knot:g} s between knots: {_said(best)}")
+        if problem.score(best) < problem.score(begun):
+            break
+    return best
+
+
+def _ascended(problem: Problem, spline: Spline, begun: Candidate, effort: int) -> Candidate:
+    """Return the best of ``effort`` splines, the first of them near a motion.
 
     Each next one maximises the linearised criterion near the best: successive linear programs, R.
     E. Griffith and R. A. Stewart, Management Science 7, 4 (1961). It is kept where it is better and
     nothing stands against it.
     """
-    spline = Spline(problem.limits, problem.seconds)
     basis = spline.basis(problem.step)
     best = problem.candidate(spline, spline.nearest(begun.motion(problem.step)))
     radius, slopes = RADIUS, None
@@ -377,7 +394,6 @@ def improved(
             best, slopes, radius = one, None, min(1.5 * radius, WIDEST)
         elif (radius := 0.4 * radius) < NARROWEST:
             break
-    progress(f"{spline.name}, from {begun.name}: {_said(best)}")
     return best
 
 

@@ -209,15 +209,17 @@ class Spline(Family):
     """Cubic spline of each joint: numbers are its control points, the first and the last at rest.
 
     Its positions, velocities and accelerations lie between its control points and their
-    differences, so that limits are linear in the numbers.
+    differences, so that limits are linear in the numbers. Its knots are about ``knot`` apart [s].
     """
+
+    knot: float = KNOT
 
     name = "spline"
 
     @property
     def _count(self) -> int:
         """Control points that are free: three more at either end repeat it."""
-        return max(LEAST, round(self.seconds / KNOT)) - 3
+        return max(LEAST, round(self.seconds / self.knot)) - 3
 
     @property
     def size(self) -> int:
@@ -231,7 +233,7 @@ class Spline(Family):
     def basis(self, dt: float) -> tuple[csr_array, csr_array, csr_array]:
         """Return positions, velocities and accelerations by the control points, (T, m) each."""
         t = self._times(dt)
-        knots = self._knot * np.arange(-3.0, self._count + 7.0)
+        knots = self._step * np.arange(-3.0, self._count + 7.0)
         first, second = self._rates()
         return (
             BSpline.design_matrix(t, knots, 3) @ self._repeated(),
@@ -240,7 +242,7 @@ class Spline(Family):
         )
 
     @property
-    def _knot(self) -> float:
+    def _step(self) -> float:
         return self.seconds / (self._count + 3)
 
     def _repeated(self) -> csr_array:
@@ -250,8 +252,8 @@ class Spline(Family):
     def _rates(self) -> tuple[csr_array, csr_array]:
         """Return velocities and accelerations between control points, (m + 5, m), (m + 4, m)."""
         points = self._repeated()
-        first = (points[1:] - points[:-1]) / self._knot
-        return first, (first[1:] - first[:-1]) / self._knot
+        first = (points[1:] - points[:-1]) / self._step
+        return first, (first[1:] - first[:-1]) / self._step
 
     def shortened(self, numbers: Array, reach: float) -> Array:
         """Return the numbers of a motion that reaches as far as some do with a share of it."""

@@ -194,7 +194,7 @@ def test_the_best_random_motion_is_improved_the_more_the_longer(arm: Body, limit
         for seed, effort, progress in ((1, 3, lines.append), (1, 3, str), (1, 20, str), (2, 3, str))
     )
     assert first.best.name == "spline"
-    assert lines[-1].startswith(f"spline, from {first.candidates[1].name}: ")
+    assert lines[-1].startswith(f"spline, from {first.candidates[1].name}, 0.2 s")
     np.testing.assert_array_equal(first.best.numbers, again.best.numbers)
     scores = [problem.score(one.best) for one in (longer, first, other)]
     assert scores[0] < scores[1] != scores[2]
@@ -327,3 +327,18 @@ def test_columns_of_a_motion_are_named_by_joint(arm: Body, limits: Limits) -> No
     assert {len(column) for column in columns.values()} == {300}
     taken = [columns[f"tau_{joint}"] for joint in arm.joints]
     np.testing.assert_array_equal(np.transpose(taken), arm.torques(motion))
+
+
+def test_knots_come_closer_where_a_spline_cannot_follow_the_best_random_motion(
+    tmp_path: Path,
+) -> None:
+    """Fast in a small range, as accelerations allow: with 0.2 s between knots it lost to Fourier."""
+    body = body_of(FOLD)
+    text = "joints: {default: {position: [-0.1, 0.1], velocity: 2, acceleration: 20, torque: 90}}"
+    problem = Problem(body, limits_of(body, tmp_path, text), "damping", 4.0)
+    lines: list[str] = []
+    design = Design.of(problem, seed=1, effort=10, progress=lines.append)
+    tried = [line for line in lines if line.startswith("spline")]
+    assert "0.2 s between knots" in tried[0]
+    assert "0.1 s between knots" in tried[1]
+    assert design.best.name == "spline"
