@@ -139,7 +139,7 @@ class NetworkFunction(BatchModel):
     def points(self, x: Tensor) -> Tensor:
         if x.numel() > x.shape[-1] or x.requires_grad:
             return super().points(x)
-        return self._features(x.flatten()).view(*x.shape[:-1], -1)
+        return x.new_tensor(self._values(x.flatten())).view(*x.shape[:-1], -1)
 
     def at(self, theta: Tensor, points: Tensor) -> Tensor:
         n, N = len(theta), points.shape[1]
@@ -163,7 +163,7 @@ class NetworkFunction(BatchModel):
         """
         self._theta.copy_(theta)
         with torch.enable_grad():
-            return _rows(self._module(self._features(x)), self.parameters, self._units)
+            return _rows(self._module(self.points(x)), self.parameters, self._units)
 
     def gradient_and_changes(
         self, theta: Tensor, x: Tensor, component: int, directions: Tensor
@@ -172,7 +172,7 @@ class NetworkFunction(BatchModel):
         self._theta.copy_(theta)
         moved = x.new_tensor([self._values(x, along) for along in directions.tolist()])
         with torch.enable_grad():
-            phi = self._features(x).requires_grad_()
+            phi = self.points(x).requires_grad_()
             *g, slope = torch.autograd.grad(
                 self._module(phi),
                 (*self.parameters, phi),
@@ -182,10 +182,6 @@ class NetworkFunction(BatchModel):
             )
             changes = _rows(slope, self.parameters, moved.unbind())
         return torch.cat([flat(g).detach()[None], changes])
-
-    def _features(self, x: Tensor) -> Tensor:
-        """Return the features, (p,), of a state (d,)."""
-        return x.new_tensor(self._values(x))
 
     def _values(self, x: Tensor, along: Sequence[float] | None = None) -> list[float]:
         """Return the features of a state (d,), or their derivatives along a direction."""
