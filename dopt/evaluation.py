@@ -155,18 +155,24 @@ def visited_points(system: System, rng: np.random.Generator) -> tuple[Array, Arr
     return visited[inside], applied[inside]
 
 
-def simulate(system: System, inputs: Array) -> Array:
+def simulate(
+    system: System,
+    inputs: Array,
+    start: Array | None = None,
+    accelerations: Callable[[Array, Array], Array] | None = None,
+) -> Array:
     """Return the noise-free states, (T + 1, n, d), under inputs (T, n, m).
 
-    States that overflow become infinite or NaN, and stay so.
+    They start at the initial state, or at states (n, d), and follow the true accelerations of each
+    step, or others (:func:`rates`). States that overflow become infinite or NaN, and stay so.
     """
     steps, n, _ = inputs.shape
     states = np.empty((steps + 1, n, system.n_states))
-    states[0] = system.initial_state
+    states[0] = system.initial_state if start is None else start
     with np.errstate(over="ignore", invalid="ignore"):
         for t in range(steps):
-            truth = functools.partial(_learned, system, t)
-            rate = functools.partial(rates, system, truth, inputs[t])
+            there = accelerations or functools.partial(_learned, system, t)
+            rate = functools.partial(rates, system, there, inputs[t])
             states[t + 1] = next_state(system.integrator, rate, states[t], system.dt)
     return states
 

@@ -271,8 +271,9 @@ class Exploration(gymnasium.Env):
         gamma, limit = self.system.gamma, self.system.state_limit
         self.action_space = Box(-gamma, gamma, (self.system.n_inputs,), np.float64)
         self.observation_space = Box(-limit, limit, (self.system.n_states,), np.float64)
-        rng, size = np.random.default_rng(_SEED), UNITS * (len(self.system.features) + 1)
-        self._layer = MLP(width=UNITS, depth=1).initial_parameters(self.system, rng)[:size]
+        network, rng = MLP(width=UNITS, depth=1), np.random.default_rng(_SEED)
+        parameters = network.initial_parameters(self.system, rng)
+        self._weights, self._biases = network.weights(self.system, parameters)[0]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -303,8 +304,7 @@ class Exploration(gymnasium.Env):
     def _gain(self, state: Array) -> float:
         """Return the information gained at a state, and take it in (Sherman and Morrison)."""
         phi = self.system.featurize(state[None])[0]
-        weights = self._layer[: UNITS * len(phi)].reshape(UNITS, len(phi))
-        h = np.append(np.tanh(weights @ phi + self._layer[UNITS * len(phi) :]), 1.0)
+        h = np.append(np.tanh(self._weights @ phi + self._biases), 1.0)
         solved = self._covariance @ h
         added = 1.0 + float(h @ solved)
         self._covariance -= np.outer(solved, solved) / added

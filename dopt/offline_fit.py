@@ -225,13 +225,16 @@ def is_network(model: Model) -> bool:
 
 def grid_loss(spec: TrialSpec, parameters: Array) -> float:
     """Return the loss of parameters, (q,), on the evaluation grid at the last step."""
+    return _root_mean_square(_errors(spec, parameters, evaluation_set(spec.system).n_grid)[1])
+
+
+def _errors(spec: TrialSpec, parameters: Array, n: int) -> tuple[Array, Array]:
+    """Return the truth of the last step at the first n evaluation points, and the errors there."""
     system, points = spec.system, evaluation_set(spec.system)
-    states, inputs, truth = (
-        rows[: points.n_grid] for rows in (points.states, points.inputs, points.accelerations)
-    )
+    states, inputs, truth = points.states[:n], points.inputs[:n], points.accelerations[:n]
     if len(system.history) > 1:
         truth = system.learned(states, system.horizon - 1, inputs)
-    return _root_mean_square(spec.model.predict(system, parameters, states, inputs) - truth)
+    return truth, spec.model.predict(system, parameters, states, inputs) - truth
 
 
 def _root_mean_square(errors: Array) -> float:
@@ -329,16 +332,13 @@ def held_out_fit(spec: TrialSpec, parameters: Array, states: Array, inputs: Arra
         Of the trial: its samples give the covariance, NaN where the trial holds no
         information matrix, has several networks, no noise, or states that are measured with noise.
     """
-    system, points = spec.system, evaluation_set(spec.system)
-    truth = points.accelerations
-    if len(system.history) > 1:
-        truth = system.learned(points.states, system.horizon - 1, points.inputs)
-    errors = spec.model.predict(system, parameters, points.states, points.inputs) - truth
+    points = evaluation_set(spec.system)
+    truth, errors = _errors(spec, parameters, len(points.states))
     variances = np.full(truth.shape, np.nan)
     held = _information(spec)
     if held is not None:
         at = Samples(points.states, points.inputs, truth)
-        samples = recorded_samples(system, states, inputs)
+        samples = recorded_samples(spec.system, states, inputs)
         variances = predicted_variances(spec, parameters, held, samples, at)
     parts = (slice(points.n_grid), slice(points.n_grid, None))
     return HeldOut(*(_fit(truth[one], errors[one], variances[one]) for one in parts))

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dopt.control.task import Control, Feedback, Goal
-from dopt.evaluation import evaluation_set, rates
+from dopt.evaluation import evaluation_set, simulate
 from dopt.policies.base import on_sphere
-from dopt.systems.base import System, next_state
+from dopt.systems.base import System
 from dopt.types import Array
 
 # Prediction of many states over many steps, with true or modelled accelerations.
@@ -40,13 +40,7 @@ def predict(system: System, accelerations: Accelerations, states: Array, inputs:
 
     The system's integrator without noise; numbers that overflow become infinite or NaN.
     """
-    visited = np.empty((inputs.shape[1] + 1, *states.shape))
-    visited[0] = states
-    with np.errstate(over="ignore", invalid="ignore"):
-        for t in range(inputs.shape[1]):
-            rate = functools.partial(rates, system, accelerations, inputs[:, t])
-            visited[t + 1] = next_state(system.integrator, rate, visited[t], system.dt)
-    return visited[1:]
+    return simulate(system, inputs.swapaxes(0, 1), states, accelerations)[1:]
 
 
 # Cross-entropy planner: sample input sequences, keep the best, sample around them.

@@ -147,19 +147,23 @@ class MLP(Model):
         sizes = self.layer_sizes(system)
         return list(zip(self.layer_inputs(system), sizes[:-1], sizes[1:], strict=True))
 
+    def weights(self, system: System, parameters: Array) -> list[tuple[Array, Array]]:
+        """Return views of each layer's W, (..., outputs, inputs), and b in parameters, (..., q)."""
+        views, first, leading = [], 0, parameters.shape[:-1]
+        for n_in, _, n_out in self._layers(system):
+            middle, last = first + n_in * n_out, first + (n_in + 1) * n_out
+            W = parameters[..., first:middle].reshape(*leading, n_out, n_in)
+            views.append((W, parameters[..., middle:last]))
+            first = last
+        return views
+
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         features = self.featurize(system, points)
-        values, first = features[:, : self.layer_sizes(system)[0]], 0
-        for layer, (n_in, _, n_out) in enumerate(self._layers(system)):
-            if layer == self.depth:
-                values = self.output_inputs(system, values, features)
-            weights = parameters[first : first + n_in * n_out].reshape(n_out, n_in)
-            first += n_in * n_out
-            values = values @ weights.T + parameters[first : first + n_out]
-            first += n_out
-            if layer < self.depth:
-                values = np.tanh(values)
-        return values
+        values = features[:, : self.layer_sizes(system)[0]]
+        *hidden, (W, b) = self.weights(system, parameters)
+        for V, c in hidden:
+            values = np.tanh(values @ V.T + c)
+        return self.output_inputs(system, values, features) @ W.T + b
 
 
 @dataclass(frozen=True, kw_only=True)

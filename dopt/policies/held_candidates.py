@@ -7,7 +7,6 @@ of an ensemble of networks (MAX), and space filling by distances of features and
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -167,25 +166,16 @@ class DisagreementPlan(Planner):
         """Return the values of all layers of each network, (K, N, ·), the features first."""
         features = self._system.featurize(states)
         values = [np.broadcast_to(features, (len(parameters), *features.shape))]
-        layers = self._layers(parameters)
+        layers = self._model.weights(self._system, parameters)
         for i, (W, b) in enumerate(layers):
             sums = values[-1] @ W.swapaxes(1, 2) + b[:, None]
             values.append(np.tanh(sums) if i + 1 < len(layers) else sums)
         return values
 
-    def _layers(self, parameters: Array) -> list[tuple[Array, Array]]:
-        """Return views of the weights, (K, outputs, inputs), and biases of each layer."""
-        sizes, first, layers = self._model.layer_sizes(self._system), 0, []
-        for n_in, n_out in itertools.pairwise(sizes):
-            middle, last = first + n_in * n_out, first + (n_in + 1) * n_out
-            W = parameters[:, first:middle].reshape(len(parameters), n_out, n_in)
-            layers.append((W, parameters[:, middle:last]))
-            first = last
-        return layers
-
     def _loss_gradient(self, parameters: Array, states: Array, targets: Array) -> Array:
         """Return the gradient of mean_n ‖a_θ(x_n) - y_n‖² by each θ, (K, q)."""
-        values, layers = self._values(parameters, states), self._layers(parameters)
+        values = self._values(parameters, states)
+        layers = self._model.weights(self._system, parameters)
         delta = 2.0 / len(states) * (values[-1] - targets)
         parts: list[Array] = []
         for i in range(len(layers) - 1, -1, -1):

@@ -28,6 +28,7 @@ from dopt.reference.models import (
     BatchInformation,
     BatchModel,
     d_optimal_inputs,
+    flat,
     gradients_and_changes,
     input_matrix,
     jacobian,
@@ -100,7 +101,7 @@ class BatchSteps:
         self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
         self.ties = self.tensor(np.stack([d.ties for d in draws]))
         self.components = torch.tensor(np.stack([d.components for d in draws]), device=device)
-        self.model: BatchModel = model_function(self.system, self.config.model)
+        self.model = model_function(self.system, self.config.model, device)
         self.theta = self.tensor(np.stack([d.weights for d in draws]))
         self._allocate()
         self._hold_information()
@@ -306,11 +307,11 @@ class AdamLearner:
 def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:
     """Return the gradient of mean_N ‖a_θ(x) - y‖² by θ, (n, q), at (n, N, d) and (n, N, r)."""
     with torch.enable_grad():
-        at = theta.detach().requires_grad_()
-        squares = (model(at, states) - targets).square().sum(dim=-1)
-        # The gradient of a sum over trials holds each trial's gradient.
-        (gradient,) = torch.autograd.grad(squares.mean(dim=1).sum(), at)
-    return gradient
+        at, leaves = model.leaves(theta)
+        values = model(at, states)
+        slope = 2.0 / states.shape[1] * (values.detach() - targets)
+        parts = torch.autograd.grad(values, leaves, slope, materialize_grads=True)
+    return flat(parts).view_as(theta)
 
 
 class LeastSquaresLearner:
@@ -372,6 +373,7 @@ class Lockstep(BatchSteps):
         self.columns = {name: np.full((len(specs), system.horizon), np.nan) for name in COLUMNS}
         points = evaluation_set(system)
         self._visited, self._applied = self.tensor(points.states), self.tensor(points.inputs)
+        self._points = self.model.points(self._visited.unsqueeze(0))
         self._truth, self._n_grid = self.tensor(points.accelerations), points.n_grid
         self.checkpoints: dict[int, Array] = {}
         self.feedbacks: dict[int, list[Feedback | None]] = {}
@@ -406,7 +408,7 @@ class Lockstep(BatchSteps):
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""
         if len(self.system.history) > 1:
             self._truth = true_accelerations(self.system, self._visited, self._applied, t)
-        predicted = self.model(self.theta, self._visited.unsqueeze(0))
+        predicted = self.model.at(self.theta, self._points)
         squares = (predicted - self._truth).square().sum(dim=-1)
         grid, reachable = squares[:, : self._n_grid], squares[:, self._n_grid :]
         return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()

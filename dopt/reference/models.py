@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import functools
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import vmap
+from torch.func import functional_call, vmap
 from torch.nn.utils import parameters_to_vector
 
 from dopt.algorithm import TIE_MARGIN
@@ -41,185 +42,193 @@ from dopt.systems.base import System, feature_values, next_state
 from dopt.systems.properties import STEP
 from dopt.types import Array, Scalar
 
-BatchModel = Callable[[Tensor, Tensor], Tensor]
-"""a_θ of n trials: parameters (n, q) and states (n, N, d) to accelerations (n, N, r).
 
-States that are the same for all trials may have 1 in the place of n.
-"""
+class BatchModel(ABC):
+    """a_θ of n trials: parameters (n, q) and states (n, N, d) to accelerations (n, N, r).
+
+    States that are the same for all trials may have 1 in the place of n.
+    """
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+
+    def __call__(self, theta: Tensor, x: Tensor) -> Tensor:
+        return self.at(theta, self.points(x))
+
+    def points(self, x: Tensor) -> Tensor:
+        """Return what the model is a function of: the features, (..., p), of states (..., d)."""
+        values = feature_values(self._system.features, self._system.feature_scales, x.unbind(-1))
+        return torch.stack(values, dim=-1)
+
+    @abstractmethod
+    def at(self, theta: Tensor, points: Tensor) -> Tensor:
+        """Return a_θ, (n, N, r), for parameters (n, q) at :meth:`points`, (n or 1, N, ·)."""
+
+    def leaves(self, theta: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
+        """Return parameters (n, q) to call the model with, and what to differentiate by."""
+        at = theta.detach().requires_grad_()
+        return at, [at]
 
 
-def model_function(system: System, model: Model) -> BatchModel:
+def model_function(system: System, model: Model, device: str = "cpu") -> BatchModel:
     """Return a_θ of a model: a network, or the linear form of physics."""
     if isinstance(model, MLP):
-        return mlp_function(system, model)
+        return MLPFunction(system, model)
     if isinstance(model, Linear):
-        return linear_function(system)
+        return LinearFunction(system)
     if isinstance(model, Module):
-        return NetworkFunction(system, model.module(system))
+        return NetworkFunction(system, model.module(system).to(device))
     raise TypeError(f"model {model!r} is no network and not linear: run it in the kernel.")
 
 
-def features(system: System, x: Tensor) -> Tensor:
-    """Return the features, (..., p), of states (..., d)."""
-    values = feature_values(system.features, system.feature_scales, x.unbind(-1))
-    return torch.stack(values, dim=-1)
+class MLPFunction(BatchModel):
+    """Layers with tanh between them; each has its matrix, outputs by inputs, and biases."""
 
+    def __init__(self, system: System, model: MLP) -> None:
+        super().__init__(system)
+        sizes = model.layer_inputs(system), model.layer_sizes(system)[1:]
+        self._shapes = list(zip(*sizes, strict=True))
+        self._lengths = [n for n_in, n_out in self._shapes for n in (n_in * n_out, n_out)]
 
-def mlp_function(system: System, model: MLP) -> BatchModel:
-    """Return layers with tanh between them; each has its matrix, outputs by inputs, and biases."""
-    shapes = list(zip(model.layer_inputs(system), model.layer_sizes(system)[1:], strict=True))
-    sizes = [n for n_in, n_out in shapes for n in (n_in * n_out, n_out)]
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        parts = iter(theta.split(sizes, dim=1))
-        h = features(system, x).expand(len(theta), -1, -1)
-        for layer, (n_in, n_out) in enumerate(shapes):
+    def at(self, theta: Tensor, points: Tensor) -> Tensor:
+        parts = iter(theta.split(self._lengths, dim=1))
+        h = points.expand(len(theta), -1, -1)
+        for layer, (n_in, n_out) in enumerate(self._shapes):
             W, b = next(parts).unflatten(1, (n_out, n_in)).mT, next(parts).unsqueeze(1)
             h = torch.baddbmm(b, h.tanh() if layer else h, W)
         return h
 
-    return accelerations
+
+class LinearFunction(BatchModel):
+    """The offset and Ψ θ, in the system's ``linear_parameters``."""
+
+    def points(self, x: Tensor) -> Tensor:
+        """Return the offset and Ψ, (..., r, 1 + q), at states (..., d)."""
+        system, states = self._system, x.unbind(-1)
+        offset, *units = (stack(system.accelerations(states, p)) for p in system.linear_form)
+        return torch.stack([offset, *(unit - offset for unit in units)], dim=-1)
+
+    def at(self, theta: Tensor, points: Tensor) -> Tensor:
+        return points[..., 0] + (points[..., 1:] @ theta[:, None, :, None]).squeeze(-1)
 
 
-class NetworkFunction:
+class NetworkFunction(BatchModel):
     """a_θ for any module that maps the features, (p,), to accelerations, (r,).
 
-    The flat vector holds the module's parameters in the order of ``module.named_parameters()``.
-    A module that gives the same for many points at once, (N, p), is called once for them.
+    The flat vector holds the module's parameters in the order of ``module.parameters()``. A module
+    that gives the same for many points at once, (N, p), is called once for them. The module belongs
+    to the function, which writes θ of one trial into its parameters and differentiates by these: it
+    costs less than other tensors in their places, which a batch of trials needs.
     """
 
     def __init__(self, system: System, module: nn.Module) -> None:
-        self._system, self._module = system, module
-        own = [*module.parameters()]
-        self._shapes = [parameter.shape for parameter in own]
-        self._lengths = [shape.numel() for shape in self._shapes]
-        places = {id(parameter): i for i, parameter in enumerate(own)}
-        # Tables and names in which the modules look for them; tied parameters stand in several.
-        self._slots: list[tuple[dict[str, Any], str, int]] = [
-            (part._parameters, name, places[id(parameter)])
-            for part in module.modules()
-            for name, parameter in part.named_parameters(recurse=False, remove_duplicate=False)
-        ]
-        self._buffers: list[tuple[dict[str, Any], str, Tensor]] = [
-            (part._buffers, name, buffer)
-            for part in module.modules()
-            for name, buffer in part.named_buffers(recurse=False, remove_duplicate=False)
-        ]
+        super().__init__(system)
+        self._module, self.parameters = module, [*module.parameters()]
+        self._names = [name for name, _ in module.named_parameters()]
+        self._lengths = [parameter.numel() for parameter in self.parameters]
+        self._theta = parameters_to_vector(self.parameters).detach()
+        for own, part in zip(self.parameters, self._theta.split(self._lengths), strict=True):
+            own.data = part.view_as(own)
+            own.requires_grad_()  # all are learned
+        self._units = torch.eye(system.n_learned).to(self._theta).unbind()
         self._at_once: bool | None = None  # known once the module has been tried
-        self._one_by_one = vmap(self._network, in_dims=(None, 0))
-        self._over_trials, self._over_both = vmap(self._network), vmap(self._one_by_one)
+        self._one_by_one = vmap(module)
+        self._over_trials = vmap(self._network)
+        self._over_both = vmap(vmap(self._network, in_dims=(None, 0)))
 
-    def __call__(self, theta: Tensor, x: Tensor) -> Tensor:
-        n, points = len(theta), x.shape[1]
-        if n > 1:
-            phi = features(self._system, x).expand(n, -1, -1)
-            many = self._over_both if points > 1 else self._over_trials
-            return many(theta, phi if points > 1 else phi[:, 0]).view(n, points, -1)
-        if points > 1:
-            one = self._over_points(theta[0], features(self._system, x)[0])
-        elif x.requires_grad:
-            one = self._network(theta[0], features(self._system, x)[0, 0])
+    def points(self, x: Tensor) -> Tensor:
+        if x.numel() > x.shape[-1] or x.requires_grad:
+            return super().points(x)
+        return x.new_tensor(self._values(x.flatten())).view(*x.shape[:-1], -1)
+
+    def at(self, theta: Tensor, points: Tensor) -> Tensor:
+        n, N = len(theta), points.shape[1]
+        if n == 1 and not (theta.requires_grad or points.requires_grad):
+            self._theta.copy_(theta[0])
+            out = self._module(points[0, 0]) if N == 1 else self._of_many(points[0])
         else:
-            one = self._network(theta[0], self._features(x[0, 0]))
-        return one.view(1, points, -1)
+            points = points.expand(n, -1, -1)
+            many = self._over_both if N > 1 else self._over_trials
+            out = many(theta, points if N > 1 else points[:, 0])
+        values: Tensor = out.view(n, N, -1)
+        return values
+
+    def leaves(self, theta: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
+        return (theta, self.parameters) if len(theta) == 1 else super().leaves(theta)
 
     def jacobian(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return ∂a/∂θ, (r, q), for parameters (q,) at a state (d,).
 
         A pass backward for each row costs less than one for a batch of copies.
         """
+        self._theta.copy_(theta)
         with torch.enable_grad():
-            leaves = self._leaves(theta)
-            return _rows(self._call(leaves, self._features(x)), leaves)
+            return _rows(self._module(self.points(x)), self.parameters, self._units)
 
     def gradient_and_changes(
         self, theta: Tensor, x: Tensor, component: int, directions: Tensor
     ) -> Tensor:
         """Return g and its derivatives along directions (m, d), (1 + m, q), at a state (d,)."""
-        moved = [self._features(x, along) for along in directions.tolist()]
+        self._theta.copy_(theta)
+        moved = x.new_tensor([self._values(x, along) for along in directions.tolist()])
         with torch.enable_grad():
-            leaves, phi = self._leaves(theta), self._features(x).requires_grad_()
-            chosen = self._call(leaves, phi)[component]
+            phi = self.points(x).requires_grad_()
             *g, slope = torch.autograd.grad(
-                chosen, (*leaves, phi), create_graph=True, materialize_grads=True
+                self._module(phi),
+                (*self.parameters, phi),
+                self._units[component],
+                create_graph=True,
+                materialize_grads=True,
             )
-            changes = _rows(torch.stack(moved) @ slope, leaves)
-        return torch.cat([_flat(g).detach()[None], changes])
+            changes = _rows(slope, self.parameters, moved.unbind())
+        return torch.cat([flat(g).detach()[None], changes])
 
-    def _features(self, x: Tensor, along: Sequence[float] | None = None) -> Tensor:
-        """Return the features of a state (d,), or their derivative along a direction, (p,)."""
+    def _values(self, x: Tensor, along: Sequence[float] | None = None) -> list[float]:
+        """Return the features of a state (d,), or their derivatives along a direction."""
         state: list[Any] = x.tolist()
         if along is not None:
             state = [value + 1j * STEP * part for value, part in zip(state, along, strict=True)]
         values = feature_values(self._system.features, self._system.feature_scales, state)
-        return x.new_tensor(values if along is None else [v.imag / STEP for v in values])
-
-    def _leaves(self, theta: Tensor) -> list[Tensor]:
-        parts = zip(theta.detach().split(self._lengths), self._shapes, strict=True)
-        return [part.view(shape).requires_grad_() for part, shape in parts]
+        return values if along is None else [value.imag / STEP for value in values]
 
     def _network(self, theta: Tensor, phi: Tensor) -> Tensor:
-        parts = zip(theta.split(self._lengths), self._shapes, strict=True)
-        return self._call([part.view(shape) for part, shape in parts], phi)
-
-    def _call(self, weights: Sequence[Tensor], phi: Tensor) -> Tensor:
-        """Return the module's outputs with other parameters, which it has during this call alone.
-
-        As torch.func.functional_call, whose checks take longer than a small network.
-        """
-        given = [(table, name, weights[place]) for table, name, place in self._slots]
-        given += [(table, name, buffer.to(phi.device)) for table, name, buffer in self._buffers]
-        before = [(table, name, table[name]) for table, name, _ in given]
-        try:
-            for table, name, tensor in given:
-                table[name] = tensor
-            out: Tensor = self._module(phi)
-        finally:
-            for table, name, tensor in before:
-                table[name] = tensor
+        parts = zip(theta.split(self._lengths), self.parameters, strict=True)
+        weights = [part.view(own.shape) for part, own in parts]
+        out: Tensor = functional_call(
+            self._module, dict(zip(self._names, weights, strict=True)), phi
+        )
         return out
 
-    def _over_points(self, theta: Tensor, phi: Tensor) -> Tensor:
+    def _of_many(self, phi: Tensor) -> Tensor:
         if self._at_once is None:
-            expected = self._one_by_one(theta, phi)
-            self._at_once = _maps_many(self._network, theta, phi, expected)
-        return self._network(theta, phi) if self._at_once else self._one_by_one(theta, phi)
+            self._at_once = _maps_many(self._module, phi, self._one_by_one(phi))
+        out: Tensor = self._module(phi) if self._at_once else self._one_by_one(phi)
+        return out
 
 
-def _rows(values: Tensor, leaves: Sequence[Tensor]) -> Tensor:
-    """Return the gradients of values, (k,), with respect to leaves of q numbers in all: (k, q)."""
+def _rows(values: Tensor, leaves: Sequence[Tensor], directions: Sequence[Tensor]) -> Tensor:
+    """Return the gradients of values, (n,), along k directions, by leaves of q numbers: (k, q)."""
     if not values.requires_grad:  # they do not depend on them
-        return values.new_zeros(len(values), sum(map(Tensor.numel, leaves)))
-    return torch.stack(
-        [
-            _flat(torch.autograd.grad(value, leaves, retain_graph=True, materialize_grads=True))
-            for value in values
-        ]
-    )
+        return values.new_zeros(len(directions), sum(map(Tensor.numel, leaves)))
+    rows = [
+        torch.autograd.grad(values, leaves, along, retain_graph=True, materialize_grads=True)
+        for along in directions
+    ]
+    return flat([part for row in rows for part in row]).view(len(directions), -1)
 
 
-def _flat(parts: Sequence[Tensor]) -> Tensor:
+def flat(parts: Sequence[Tensor]) -> Tensor:
+    """Return all entries of tensors, one after the other."""
     return torch.cat([part.flatten() for part in parts])
 
 
-def _maps_many(network: BatchModel, theta: Tensor, phi: Tensor, expected: Tensor) -> bool:
-    """Return whether a network maps points, (N, p), to what it maps them to one by one."""
+def _maps_many(module: nn.Module, phi: Tensor, expected: Tensor) -> bool:
+    """Return whether a module maps points, (N, p), to what it maps them to one by one."""
     with torch.no_grad():
         try:
-            return torch.allclose(network(theta, phi), expected, rtol=1e-12, atol=1e-13)
+            return torch.allclose(module(phi), expected, rtol=1e-12, atol=1e-13)
         except (RuntimeError, IndexError, TypeError, ValueError):  # a user's module
             return False
-
-
-def linear_function(system: System) -> BatchModel:
-    """Return offset(x) + Ψ(x) θ in the system's ``linear_parameters``."""
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        offset, *units = (stack(system.accelerations(x.unbind(-1), p)) for p in system.linear_form)
-        psi = torch.stack([unit - offset for unit in units], dim=-1)
-        return offset + (psi @ theta[:, None, :, None]).squeeze(-1)
-
-    return accelerations
 
 
 def stack(values: Sequence[Scalar]) -> Tensor:
@@ -402,11 +411,13 @@ class Module(Model):
         return network
 
     def module(self, system: System) -> nn.Module:
-        """Return the network for a system, with parameters that nobody should rely on."""
-        return _network(self, len(system.features), system.n_learned)
+        """Return a new network for a system, with parameters that nobody should rely on."""
+        sizes = len(system.features), system.n_learned
+        _n_parameters(self, *sizes)
+        return _built(self, *sizes, 0)
 
     def n_parameters(self, system: System) -> int:
-        return sum(parameter.numel() for parameter in self.module(system).parameters())
+        return _n_parameters(self, len(system.features), system.n_learned)
 
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
         seed = int(rng.integers(2**63 - 1))
@@ -414,10 +425,14 @@ class Module(Model):
         return _array(parameters_to_vector(drawn.parameters()))
 
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
-        function = NetworkFunction(system, self.module(system))
         theta, states = torch.as_tensor(parameters), torch.as_tensor(points)
         with torch.no_grad():
-            return _array(function(theta[None], states[None])[0])
+            return _array(_function(self, system)(theta[None], states[None])[0])
+
+
+@functools.lru_cache(maxsize=16)
+def _function(model: Module, system: System) -> NetworkFunction:
+    return NetworkFunction(system, model.module(system))
 
 
 def _canonical(given: Mapping[str, object]) -> str:
@@ -432,8 +447,8 @@ def _canonical(given: Mapping[str, object]) -> str:
 
 
 @functools.lru_cache(maxsize=16)
-def _network(model: Module, n_features: int, n_outputs: int) -> nn.Module:
-    """Return a network that has been tried out."""
+def _n_parameters(model: Module, n_features: int, n_outputs: int) -> int:
+    """Return the number of parameters of a network, which is tried out."""
     module = _built(model, n_features, n_outputs, 0)
     try:
         out = module(torch.zeros(n_features, dtype=torch.float64))
@@ -442,9 +457,10 @@ def _network(model: Module, n_features: int, n_outputs: int) -> nn.Module:
     if not isinstance(out, torch.Tensor) or out.shape != (n_outputs,):
         shape = tuple(out.shape) if isinstance(out, torch.Tensor) else type(out).__name__
         raise _wrong(model, f"maps {n_features} features to shape ({n_outputs},)", shape)
-    if not any(parameter.numel() for parameter in module.parameters()):
+    count = sum(parameter.numel() for parameter in module.parameters())
+    if not count:
         raise _wrong(model, "has parameters", "none")
-    return module
+    return count
 
 
 def _built(model: Module, n_features: int, n_outputs: int, seed: int) -> nn.Module:
@@ -524,7 +540,7 @@ def planning_columns(
     system: System, model: BatchModel, theta: Tensor, x: Tensor, components: Tensor
 ) -> Tensor:
     """Return g and the columns of D B as rows, (n, 1 + m, q), for components (n,)."""
-    bar = predicted_states(system, model, theta, x)
+    bar = predicted_states(system, model, theta, x).detach()
     B = input_matrix(system, bar)
     n, m = len(x), B.shape[2]
     if n == 1 and isinstance(model, NetworkFunction):

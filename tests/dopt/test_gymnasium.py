@@ -11,6 +11,7 @@ import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
+from dopt.models import MLP
 from dopt.offline_fit import recorded_samples
 from dopt.reference.batch import run_trials
 from dopt.run import rerun, run_trial
@@ -69,10 +70,9 @@ def test_the_reward_is_the_information_about_random_features() -> None:
         states.append(state)
         rewards.append(reward)
     p, units = 3, 64
-    weights = environment._layer[: p * units].reshape(units, p)
-    hidden = np.tanh(
-        environment.system.featurize(np.array(states)) @ weights.T + environment._layer[p * units :]
-    )
+    layer = MLP(width=units).initial_parameters(environment.system, np.random.default_rng(0))
+    weights, biases = layer[: p * units].reshape(units, p), layer[p * units : (p + 1) * units]
+    hidden = np.tanh(environment.system.featurize(np.array(states)) @ weights.T + biases)
     h = np.column_stack([hidden, np.ones(len(states))])
     first = 1e-3 * np.eye(units + 1) + np.outer(h[0], h[0])
     gain = np.linalg.slogdet(first + h[1:].T @ h[1:])[1] - np.linalg.slogdet(first)[1]

@@ -62,7 +62,9 @@ def test_one_trial_has_the_derivatives_of_a_batch(env: str) -> None:
     system = SYSTEMS[env]()
     r = system.n_learned
     torch.manual_seed(0)
-    function = NetworkFunction(system, Stack(len(system.features), r).double())
+    module = Stack(len(system.features), r).double()
+    module.layers[0].requires_grad_(False)  # it is learned all the same
+    function = NetworkFunction(system, module)
     q = sum(parameter.numel() for parameter in function._module.parameters())
     theta, x = 0.5 * torch.randn(2, q).double(), torch.randn(2, system.n_states).double()
     k = torch.tensor([r - 1, 0])
@@ -112,7 +114,7 @@ def test_a_network_is_called_once_for_many_points_where_that_gives_the_same(
 
 
 class Tied(nn.Module):
-    """Uses a layer twice, a matrix under two names, a normalised layer, and counts its calls."""
+    """Uses a layer twice, a matrix under two names, and counts its calls."""
 
     calls: torch.Tensor
 
@@ -121,35 +123,63 @@ class Tied(nn.Module):
         self.inner = nn.Sequential(nn.Linear(3, 3), nn.Tanh())
         self.again = nn.Linear(3, 3)
         self.again.weight = self.inner[0].weight
-        self.normal = nn.utils.parametrizations.weight_norm(nn.Linear(3, 1))
+        self.last = nn.Linear(3, 1)
         self.register_buffer("calls", torch.zeros(()))
         self.double()
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         self.calls += 1.0
-        if not bool(features.detach().isfinite().all()):
-            raise RuntimeError("features are not finite")
-        out: torch.Tensor = self.normal(self.again(self.inner(self.inner(features))))
+        out: torch.Tensor = self.last(self.again(self.inner(self.inner(features))))
         return out
 
 
-def test_a_module_has_other_parameters_during_a_call_alone() -> None:
-    """torch.func.functional_call is the oracle."""
-    system, module = SYSTEMS["pendulum"](), Tied()
-    own = {name: (one, one.detach().clone()) for name, one in module.named_parameters()}
-    theta = torch.randn(1, sum(one.numel() for one, _ in own.values())).double()
-    parts = theta[0].split([one.numel() for one, _ in own.values()])
-    named = {n: part.view_as(own[n][0]) for n, part in zip(own, parts, strict=True)}
-    function = NetworkFunction(system, module)
-    x = torch.randn(1, 1, system.n_states).double()
-    features = torch.tensor(system.featurize(x[0].numpy()))[0]
-    expected = torch.func.functional_call(module, named, (features,))
-    assert torch.equal(function(theta, x)[0, 0], expected)
+class Strict(Tied):
+    """Has a normalised layer, and refuses what is not finite."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = nn.utils.parametrizations.weight_norm(self.last)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        if not bool(features.detach().isfinite().all()):
+            raise RuntimeError("features are not finite")
+        return super().forward(features)
+
+
+@pytest.mark.parametrize(("kind", "n"), [(Strict, 1), (Tied, 2)])
+def test_a_module_is_called_with_the_parameters_of_each_trial(kind: type[Tied], n: int) -> None:
+    """torch.func.functional_call of another module is the oracle."""
+    system, other = SYSTEMS["pendulum"](), kind()
+    function = NetworkFunction(system, kind())
+    sizes = {name: one.shape for name, one in other.named_parameters()}
+    theta = torch.randn(n, sum(size.numel() for size in sizes.values())).double()
+    x = torch.randn(n, 1, system.n_states).double()
+    for i in range(n):
+        parts = theta[i].split([size.numel() for size in sizes.values()])
+        named = {one: part.view(sizes[one]) for one, part in zip(sizes, parts, strict=True)}
+        features = torch.tensor(system.featurize(x[i].numpy()))[0]
+        expected = torch.func.functional_call(other, named, (features,))
+        assert torch.equal(function(theta[i : i + 1], x[i : i + 1])[0, 0], expected)
+        torch.testing.assert_close(function(theta, x)[i, 0], expected, rtol=1e-12, atol=1e-13)
+
+
+def test_two_trials_of_one_network_have_parameters_of_their_own() -> None:
+    spec = specification()
+    alone = run_trial(spec).parameters
+    batches = [Lockstep([spec]), Lockstep([spec.with_seed(1)])]
+    with torch.no_grad():
+        for t in range(spec.system.horizon):
+            for batch in batches:
+                batch.step(t)
+    np.testing.assert_array_equal(batches[0].theta[0].numpy(), alone)
+
+
+def test_an_error_of_a_module_comes_through() -> None:
+    system = SYSTEMS["pendulum"]()
+    function = NetworkFunction(system, Strict())
+    theta = torch.zeros(1, sum(one.numel() for one in function.parameters)).double()
     with pytest.raises(RuntimeError, match="not finite"):
-        function(theta, x * torch.inf)
-    now = dict(module.named_parameters())
-    assert all(now[n] is one and torch.equal(one, before) for n, (one, before) in own.items())
-    assert module.again.weight is module.inner[0].weight
+        function(theta, torch.full((1, 1, system.n_states), torch.inf).double())
 
 
 @pytest.mark.parametrize("friction", [50.0, 1000.0, 1e120])
