@@ -332,7 +332,7 @@ def test_columns_of_a_motion_are_named_by_joint(arm: Body, limits: Limits) -> No
 def test_knots_come_closer_where_a_spline_cannot_follow_the_best_random_motion(
     tmp_path: Path,
 ) -> None:
-    """Fast in a small range, as accelerations allow: with 0.2 s between knots it lost to Fourier."""
+    """Fast lines in a small range: with 0.2 s between knots it lost to Fourier series."""
     body = body_of(FOLD)
     text = "joints: {default: {position: [-0.1, 0.1], velocity: 2, acceleration: 20, torque: 90}}"
     problem = Problem(body, limits_of(body, tmp_path, text), "damping", 4.0)
