@@ -21,7 +21,6 @@ from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Motion
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Parameter, Unknowns, count_null, relative_errors
-from dopt.robots.report import Report
 from dopt.robots.trajectories import KNOT, ROOM, Family, Fourier, Ladder, Multisine, Spline
 from dopt.types import Array
 
@@ -226,17 +225,6 @@ class Problem:
         touching = body.collisions(motion.positions)
         return f"the bodies {touching[0][1]} and {touching[0][2]} touch" if touching else ""
 
-    def check(self, seed: int = 0) -> Report:
-        """Report which parameters the best of some random multisines identifies, and how well.
-
-        It prints as text: ``print(problem.check())``.
-        """
-        best = multisine(self, np.random.default_rng(whole("seed", seed, 0, 2**63)))
-        report = Report.of(self, best, REFERENCES)
-        if obstacle := self.obstacle(best):
-            report["notes"].append(f"the best multisine breaks limits: {obstacle}")
-        return report
-
     def checked(self, one: Candidate) -> Candidate:
         """Return a candidate, broken only if something stands against it at finer steps."""
         return dataclasses.replace(one, broken=float(bool(self.obstacle(one))))
@@ -270,10 +258,6 @@ class Design:
     @property
     def best(self) -> Candidate:
         return self.candidates[0]
-
-    def report(self) -> Report:
-        """Report the candidates, and what the best one identifies; it prints as text."""
-        return Report.of(self.problem, self.best, REFERENCES).add_design(self)
 
     @classmethod
     def of(

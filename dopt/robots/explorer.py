@@ -17,10 +17,9 @@ from scipy.stats import chi2
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
 from dopt.robots.body import Body, KnownBody, Motion, listed
-from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner
+from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner, window_size
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard, Tracker, possible_acceleration
-from dopt.robots.windows import window_size
 from dopt.sphere import sphere_maximizer
 from dopt.types import Array
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
+from dopt.arguments import whole
+from dopt.robots.design import REFERENCES, Candidate, Design, Problem, multisine
 from dopt.robots.parameters import Identifiability
-
-if TYPE_CHECKING:
-    from dopt.robots.design import Candidate, Design, Problem
 
 SHOWN = 20
 """Rows of a list that are printed; the dictionary has all."""
@@ -30,13 +29,42 @@ class Report(dict[str, Any]):
     """
 
     @classmethod
-    def of(cls, problem: Problem, one: Candidate, motions: int) -> Self:
-        """Report what one motion, the best of some random ones, tells of the parameters."""
+    def check(cls, problem: Problem, seed: int = 0) -> Self:
+        """Report which parameters the best of some random multisines identifies, and how well."""
+        best = multisine(problem, np.random.default_rng(whole("seed", seed, 0, 2**63)))
+        report = cls._expecting(problem, best)
+        if obstacle := problem.obstacle(best):
+            report["notes"].append(f"the best multisine breaks limits: {obstacle}")
+        return report
+
+    @classmethod
+    def of(cls, design: Design) -> Self:
+        """Report the candidates of a design, and what the best one identifies."""
+        problem, best = design.problem, design.best
+        report = cls._expecting(problem, best)
+        motion = best.motion(1.0 / problem.rate)
+        strain = float(problem.strains(motion).max())
+        report["best"], report["gap"] = best.name, design.gap
+        report["candidates"] = [
+            {
+                "name": one.name,
+                "share": one.share,
+                "error_by_reference": math.exp(float(np.log(one.errors / design.reference).mean())),
+                "worst_by_reference": float((one.errors / design.reference).max()),
+                "within_limits": one.free,
+            }
+            for one in design.candidates
+        ]
+        report["limits"] = problem.limits.shares(motion) | {"torque": strain}
+        return report
+
+    @classmethod
+    def _expecting(cls, problem: Problem, one: Candidate) -> Self:
         found = Identifiability.of(problem.unknowns, one.motion(problem.step), problem.rate)
         return cls(
             joints=list(problem.body.joints),
             notes=[*problem.body.notes, *problem.limits.notes],
-            motions=motions,
+            motions=REFERENCES,
             seconds=problem.seconds,
             null=found.null,
             weak=found.weak,
@@ -51,25 +79,6 @@ class Report(dict[str, Any]):
                 for parameter, error in zip(problem.requested, one.errors, strict=True)
             ],
         )
-
-    def add_design(self, design: Design) -> Self:
-        """Add the candidates of a design and the limits that the best one takes."""
-        problem, best = design.problem, design.best
-        motion = best.motion(1.0 / problem.rate)
-        strain = float(problem.strains(motion).max())
-        self["best"], self["gap"] = best.name, design.gap
-        self["candidates"] = [
-            {
-                "name": one.name,
-                "share": one.share,
-                "error_by_reference": math.exp(float(np.log(one.errors / design.reference).mean())),
-                "worst_by_reference": float((one.errors / design.reference).max()),
-                "within_limits": one.free,
-            }
-            for one in design.candidates
-        ]
-        self["limits"] = problem.limits.shares(motion) | {"torque": strain}
-        return self
 
     def __str__(self) -> str:
         lines = [f"note: {note}" for note in self["notes"]]

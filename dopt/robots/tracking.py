@@ -8,8 +8,8 @@ import numpy as np
 
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, Contacts, KnownBody
+from dopt.robots.friction import ENCODER
 from dopt.robots.limits import Limits
-from dopt.robots.windows import ENCODER
 from dopt.types import Array
 
 JITTER = 0.003

@@ -95,7 +95,9 @@ def _run(arguments: argparse.Namespace) -> ExitCode:
 
 def _check(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
     """Say what the best of some random multisines can and cannot identify."""
-    return _answer(arguments, problem.check(arguments.seed))
+    from dopt.robots.report import Report
+
+    return _answer(arguments, Report.check(problem, arguments.seed))
 
 
 def _answer(arguments: argparse.Namespace, report: Report, written: Sequence[str] = ()) -> ExitCode:
@@ -109,6 +111,7 @@ def _answer(arguments: argparse.Namespace, report: Report, written: Sequence[str
 
 def _design(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
     from dopt.robots.design import Design
+    from dopt.robots.report import Report
 
     for option, target in (("--out", arguments.out), ("--ros", arguments.ros)):
         if target:  # before minutes of search
@@ -130,7 +133,7 @@ def _design(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
     if arguments.ros:
         _write_ros(arguments.ros, problem, motion)
         written.append(f"JointTrajectory: {arguments.ros}")
-    return _answer(arguments, design.report(), written)
+    return _answer(arguments, Report.of(design), written)
 
 
 def _write_csv(target: Path, problem: Problem, motion: Motion) -> None:

@@ -22,11 +22,10 @@ import pandas as pd
 from dopt.robots.body import Body, KnownBody, Motion
 from dopt.robots.design import DRAWN, REFERENCES, Design, Problem
 from dopt.robots.explorer import RobotExplorer
-from dopt.robots.friction import SPEEDS, FrictionLearner
+from dopt.robots.friction import SPEEDS, FrictionLearner, window_size
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Tracker, possible_acceleration
 from dopt.robots.trajectories import Multisine
-from dopt.robots.windows import window_size
 from dopt.types import Array
 from studies.robots.simulated import CONTROL, LIMITS, SimulatedRobot, iiwa, jaco
 

@@ -16,6 +16,7 @@ from dopt.robots.body import Body, Motion
 from dopt.robots.design import LEAST, Design, Problem, attainable, gradient, multisine
 from dopt.robots.limits import Limits
 from dopt.robots.parameters import relative_errors
+from dopt.robots.report import Report
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine, Spline
 from tests.dopt.robots.test_body import FOLD, arm, body_of, jaco, limits, limits_of
 
@@ -307,12 +308,12 @@ def test_what_stands_against_every_motion_is_named(tmp_path: Path) -> None:
 
 def test_reports_print_and_hold_what_json_can(arm: Body, limits: Limits) -> None:
     problem = Problem(arm, limits, "all", 3.0)
-    seen = problem.check(seed=1)
+    seen = Report.check(problem, seed=1)
     assert json.loads(json.dumps(seen)) == seen
     assert f"{len(seen['null'])} combinations" in str(seen)
     assert all(item in str(seen) for item in seen["null"][:20])
     design = Design.of(Problem(arm, limits, "damping", 3.0), seed=1, effort=2)
-    told = design.report()
+    told = Report.of(design)
     assert json.loads(json.dumps(told)) == told
     assert [row["name"] for row in told["candidates"]] == [one.name for one in design.candidates]
     assert "every combination of the parameters changes the torques" in str(told)

@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
-from dopt.robots.friction import CoulombViscous, FrictionLearner, Network
+from dopt.robots.friction import (
+    CoulombViscous,
+    FrictionLearner,
+    Network,
+    Window,
+    boundary,
+    half_widths,
+)
 from dopt.robots.limits import Limits
-from dopt.robots.windows import Window, boundary, half_widths
 
 DT = 0.002
 
