@@ -50,7 +50,7 @@ SURE = 0.9
 """Share of what is left open; of a regular input the motion, which is as regular, has up to .8."""
 
 FAR = 7.5
-"""What an input's past leaves open of a row, by its median, above which it jumps there."""
+"""Part of an input that its past leaves open, by its median, above which it jumps there."""
 
 ENOUGH = 20
 """Rows for each fitted number in which an input moves, from which chance explains less of it."""

@@ -82,7 +82,7 @@ def _made(whose: str, method: str, make: Callable[[], T], base: type) -> T:
 def check_custom_parts(specs: Iterable[TrialSpec]) -> None:
     """Make one plan and one update of each user's class among the policies and learners.
 
-    Other errors than those of missing methods are left to the trials: they may be of some alone.
+    Other errors are left to the trials, as they may concern some trials only.
 
     Raises
     ------

@@ -159,7 +159,7 @@ def work_for(d: int, m: int, columns: int, unknown: int, p: int, w: int) -> Work
 
 
 class Problem(NamedTuple):
-    """What windows are simulated with, and room for one of them."""
+    """Data, model and inputs of the simulation of windows, and room for one window."""
 
     structure: Structure
     values: Values

@@ -58,7 +58,7 @@ FLOOR = 3.0
 """Weight of the logarithm by which the worst error exceeds its reference."""
 
 SHARP = 20.0
-"""How much an error below the worst one counts less in the slope of the penalty."""
+"""Decay of what an error counts in the slope of the penalty, by its distance to the worst one."""
 
 LEAST = 0.1
 """Share of its scale that an unknown parameter is at the least, where torques are linearised.
@@ -346,16 +346,17 @@ def improved(
 ) -> Candidate:
     """Return the best spline of some, which begin near a motion.
 
-    Its knots come closer until it is better than the motion that it begins from: one with few knots
-    cannot follow fast lines.
+    Knots come closer until a spline is better than the motion that it begins from: one with few
+    knots cannot follow fast lines.
     """
+    found: list[Candidate] = []
     for knot in KNOTS:
         spline = Spline(problem.limits, problem.seconds, knot)
-        best = _ascended(problem, spline, begun, effort)
-        progress(f"{spline.name}, from {begun.name}, {knot:g} s between knots: {_said(best)}")
-        if problem.score(best) < problem.score(begun):
+        found.append(_ascended(problem, spline, begun, effort))
+        progress(f"{spline.name}, from {begun.name}, {knot:g} s between knots: {_said(found[-1])}")
+        if problem.score(found[-1]) < problem.score(begun):
             break
-    return best
+    return min(found, key=problem.score)
 
 
 def _ascended(problem: Problem, spline: Spline, begun: Candidate, effort: int) -> Candidate:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 import sqlite3
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from orchestrate.runner.saving import RetryingStore
 from orchestrate.runner.start import Output, recorded_launch
 from orchestrate.store import Reader
 from tests.orchestrate.conftest import RECORD
-from tests.orchestrate.faults.laboratory import Laboratory, Server, stands_still
+from tests.orchestrate.faults.laboratory import Laboratory, Launched, Server, stands_still
 from tests.orchestrate.faults.trials import grid_of
 from tests.waiting import PATIENCE_SECONDS
 
@@ -44,7 +44,7 @@ class Messages:
     fatal
         Number of the message whose session ends before it is carried out; None for no message.
     lost
-        Whether it is carried out first, and its answer is lost, as only that of a commit matters.
+        Whether it is carried out first and its answer is lost: only a commit's answer matters.
     """
 
     server: Server
@@ -158,6 +158,17 @@ def test_a_session_that_ends_at_any_message_costs_one_repetition(
         check(url, 1 + exists)
 
 
+@contextmanager
+def asleep(laboratory: Laboratory, statement: str) -> Iterator[Launched]:
+    """Yield a launch that stopped itself before a statement; woken, it ends well as one of two."""
+    with laboratory.launched(stop=statement) as sleeper:
+        sleeper.until(lambda: stands_still(sleeper.pid))
+        yield sleeper
+        sleeper.ends()
+    laboratory.check()
+    assert laboratory.query("SELECT state, count(*) FROM launch GROUP BY 1") == [("done", 2)]
+
+
 STATEMENTS = ("CREATE TABLE launch", "INSERT INTO launch", "LOCK", "INSERT INTO trial", "UPDATE tr")
 
 
@@ -166,13 +177,9 @@ def test_a_launch_that_sleeps_past_its_lease_while_it_registers_goes_on(
     postgresql_url: str, laboratory_at: At, statement: str
 ) -> None:
     laboratory = laboratory_at(postgresql_url, trials=5, executor="inprocess", settings=SHORT)
-    with laboratory.launched(stop=statement) as sleeper:
-        sleeper.until(lambda: stands_still(sleeper.pid))
+    with asleep(laboratory, statement) as sleeper:
         laboratory.complete()
         sleeper.send(signal.SIGCONT)
-        sleeper.ends()
-    laboratory.check()
-    assert laboratory.query("SELECT state, count(*) FROM launch GROUP BY 1") == [("done", 2)]
 
 
 def file_of(laboratory: Laboratory) -> Path:
@@ -184,15 +191,10 @@ def test_others_wait_for_a_sleeper_that_registers_in_a_file(
     sqlite_url: str, laboratory_at: At, statement: str
 ) -> None:
     laboratory = laboratory_at(sqlite_url, trials=5, executor="inprocess", settings=SHORT)
-    with laboratory.launched(stop=statement) as sleeper:
-        sleeper.until(lambda: stands_still(sleeper.pid))
-        with laboratory.launched() as other:
-            other.until(lambda: "waiting for a lock" in other.errors)
-            sleeper.send(signal.SIGCONT)
-            sleeper.ends()
-            other.ends()
-    laboratory.check()
-    assert laboratory.query("SELECT state, count(*) FROM launch GROUP BY 1") == [("done", 2)]
+    with asleep(laboratory, statement) as sleeper, laboratory.launched() as other:
+        other.until(lambda: "waiting for a lock" in other.errors)
+        sleeper.send(signal.SIGCONT)
+        other.ends()
 
 
 @pytest.mark.parametrize("exists", [False, True], ids=["new", "existing"])
