@@ -189,7 +189,9 @@ def positive(option: str, number: type[int] | type[float]) -> Callable[[str], fl
             option, number, expected, lambda value: 0 < value < float("inf"), given
         )
         if value >= LARGEST:
-            raise UsageError(f"{option} is {given!r}, less than {LARGEST:,} is expected: give a smaller one.")
+            raise UsageError(
+                f"{option} is {given!r}, less than {LARGEST:,} is expected: give a smaller one."
+            )
         return value
 
     return read
