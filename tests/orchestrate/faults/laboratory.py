@@ -22,7 +22,7 @@ from typing import Any
 import psycopg
 
 from orchestrate.store import NoDatabaseError, Reader, StoreError
-from tests.orchestrate.faults.program import Order, carry_out, errors_beside
+from tests.orchestrate.faults.program import Order, begun_beside, carry_out, errors_beside
 from tests.orchestrate.faults.trials import Gate
 from tests.orchestrate.store.databases import execute
 from tests.orchestrate.store.processes import CLEAN
@@ -196,6 +196,7 @@ class Laboratory:
         process.start()
         launched = Launched(process, output)
         try:
+            until(lambda: begun_beside(output).exists() or not process.is_alive())
             yield launched
         finally:
             launched.kill()

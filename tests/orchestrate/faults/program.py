@@ -87,13 +87,14 @@ def carry_out(order: Order, output: Path) -> None:
     faulthandler.register(signal.SIGUSR1)
     # As from a terminal: a test run in the background of a shell leaves Ctrl-C ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    if order.environment:
-        _start_again(order, output)
-    if order.pause:
-        _PAUSES[order.pause](lambda: _stop_for_ever(output.with_suffix(".paused")))
-    if order.stop:
-        _stop_before(order.stop)
     try:
+        begun_beside(output).touch()
+        if order.environment:
+            _start_again(order, output)
+        if order.pause:
+            _PAUSES[order.pause](lambda: _stop_for_ever(output.with_suffix(".paused")))
+        if order.stop:
+            _stop_before(order.stop)
         sys.exit(_launch(order))
     except KeyboardInterrupt:  # also while a library is imported
         sys.exit(ExitCode.INTERRUPTED)
@@ -101,6 +102,11 @@ def carry_out(order: Order, output: Path) -> None:
 
 def errors_beside(output: Path) -> Path:
     return output.with_suffix(".err")
+
+
+def begun_beside(output: Path) -> Path:
+    """Return the file that is there once signals are answered as by a launch."""
+    return output.with_suffix(".begun")
 
 
 def _start_again(order: Order, output: Path) -> None:
