@@ -159,7 +159,7 @@ class _Episode:
         applied: Array = sent.astype(np.float64)
         reached, truncated = self._advance(sent)
         if truncated:
-            self._begin_anew()
+            self._restart()
             reached, truncated = self._advance(sent)
         if truncated:
             raise self._truncated("its first step")
@@ -177,7 +177,7 @@ class _Episode:
             return np.full_like(reached, np.nan), False
         return reached, bool(truncated)
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         if not self._system.restarts:
             raise self._truncated(f"step {self._steps + 1}")
         self._pieces, self._steps = self._pieces + 1, 0

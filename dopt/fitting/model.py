@@ -212,7 +212,7 @@ def unknown_of(plant: Plant) -> dict[str, Unknown]:
 
 
 class Layout(NamedTuple):
-    """How the inputs and outputs of a network are scaled: seen ranges of a fit without one."""
+    """Scales of the inputs and outputs of a network: seen ranges of a fit without one."""
 
     centers: Array  # (p,)
     scales: Array  # (p,)

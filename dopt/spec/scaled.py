@@ -98,8 +98,8 @@ def scaled(system: System) -> Scaled:
 def in_scaled_numbers(spec: TrialSpec, *, damped: bool = True) -> TrialSpec:
     """Return the specification of a new exploration.
 
-    That of a plant works with scaled numbers, unless a policy, model or learner is of a user's own
-    class, which is given the numbers of the plant that it was written for. ``damped`` says whether
+    An exploration of a plant works with scaled numbers, unless a policy, model or learner is a
+    class of the user, which is given the numbers of the plant that it was written for. ``damped`` says whether
     fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
     """
     parts = ((spec.policy, POLICIES), (spec.model, MODELS), (spec.learner, LEARNERS))

@@ -454,7 +454,7 @@ def jensen_renyi_divergence(mean: Array, variance: Array) -> Array:
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of the learning, by their names in Stable-Baselines3 but for ``units``.
+    """Settings of the learning, by their names in Stable-Baselines3, except ``units``.
 
     Attributes
     ----------
@@ -596,7 +596,7 @@ class GlobalRandomness:
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Make the global generators those of the agent; afterwards they are as before."""
+        """Lend the global generators to the agent; afterwards they are as before."""
         with _kept():
             _restore(self._states)
             yield

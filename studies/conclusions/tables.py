@@ -110,7 +110,7 @@ def conclusions_best(rows: pd.DataFrame | None = None) -> str:
 
 
 def conclusions_oracle(rows: pd.DataFrame | None = None) -> str:
-    """Losses on the pendulum over those of the oracle with the same seed."""
+    """Losses on the pendulum divided by the losses of the oracle with the same seed."""
     rows = read() if rows is None else rows
     oracle = losses(rows, "pendulum", "ideal", "oracle", "least_squares")
     body = []
