@@ -99,8 +99,8 @@ def in_scaled_numbers(spec: TrialSpec, *, damped: bool = True) -> TrialSpec:
     """Return the specification of a new exploration.
 
     An exploration of a plant works with scaled numbers, unless a policy, model or learner is a
-    class of the user, which is given the numbers of the plant that it was written for. ``damped`` says whether
-    fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
+    class of the user, which is given the numbers of the plant that it was written for. ``damped``
+    says whether fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
     """
     parts = ((spec.policy, POLICIES), (spec.model, MODELS), (spec.learner, LEARNERS))
     shipped = all(type(part) in [*registry.values()] for part, registry in parts)
