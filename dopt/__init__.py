@@ -29,6 +29,7 @@ shows the equations, units and defaults of one.
 ``POLICIES``            exploration policies by name
 ``MODELS``              models of the learned accelerations by name
 ``LEARNERS``            learning rules by name
+``DoptError``           base of all errors that say what was given, expected, and what to do
 ======================  ========================================================================
 
 Each name is imported when it is first used: ``import dopt`` alone loads none of the libraries.
@@ -40,6 +41,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from dopt.errors import DoptError as DoptError
     from dopt.explorer import Explorer as Explorer
     from dopt.fitting.choice import choose as choose
     from dopt.fitting.fit import fit as fit
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"  # also where nothing is installed, as beside PYTHONPATH in the image
 
 _MODULES = {
+    "DoptError": "dopt.errors",
     "Explorer": "dopt.explorer",
     "LEARNERS": "dopt.learning",
     "Log": "dopt.log",
