@@ -35,6 +35,7 @@ from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import (
+    FEWEST,
     HORIZONS,
     Predicted,
     Simulator,
@@ -440,8 +441,11 @@ class _Selection:
 
     def held_out(self) -> dict[str, list[Predicted]]:
         """Return predictions of each block up to the longest horizon, by what made them."""
-        longest = min(max(HORIZONS) * self.window, 0.5 * self._longest_block())
-        tested = [self._tested(self.window, block, longest) for block in range(len(self.blocks))]
+        for share in reversed(HORIZONS):
+            ahead = min(share * self.window, 0.5 * self._longest_block())
+            tested = [self._tested(self.window, block, ahead) for block in range(len(self.blocks))]
+            if sum(map(len, tested)) >= FEWEST:
+                break
         out: dict[str, list[Predicted]] = {}
         for what, (model, folds) in self._folds.items():
 
