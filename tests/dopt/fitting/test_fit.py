@@ -592,6 +592,15 @@ def test_short_runs_are_judged_as_far_as_they_go() -> None:
         assert short.verdict().startswith(words)
 
 
+def test_a_log_that_is_short_beside_its_motion_is_said(fitted: Fitted) -> None:
+    """Windows of a few samples were taken without a word."""
+    short = dopt.fit(declared(), run(0, 156), width=0)
+    [note] = [one for one in short.selection.notes if one.startswith("the log is short")]
+    assert f"windows of {short.selection.window:.2g} s are the longest" in note
+    assert "record" in note
+    assert "the log is short" not in fitted.report()
+
+
 def test_stamps_in_another_unit_are_refused() -> None:
     """They were integrated in steps of the plant's dt, for hours."""
     table = run(0, 60)
