@@ -22,7 +22,7 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import TURN, Log, count_text, is_clock
+from dopt.log import TURN, Log, clock_unit, count_text, is_clock
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, path, positive, tell
 from orchestrate.store import Store
@@ -334,9 +334,8 @@ def lines(
 
     The units of ``declared`` states, or of the "time", are not doubted.
     """
-    told = "time" in declared or any(
-        "Stamps are" in one or ": times count" in one for one in log.notes
-    )
+    told = "time" in declared or any(clock_unit(one) for one in table)
+    told |= any("Stamps are" in one or ": times count" in one for one in log.notes)
     yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:
         yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"

@@ -277,9 +277,7 @@ class Fitted:
         left = longest - history - skip - ahead - 2.0 * self.plant.dt
         for horizon in reversed(self.horizons):
             lengths = history, max(0.0, min(horizon, left))
-            rows = prediction_rows(
-                data, (0, len(data.time) - 1), *lengths, skip=skip, ahead=ahead
-            )
+            rows = prediction_rows(data, (0, len(data.time) - 1), *lengths, skip=skip, ahead=ahead)
             if len(rows) >= FEWEST:
                 break
         models = {"model": self.chosen, "physics alone": self.physics}
