@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from analysis.style import number
 from dopt.errors import given_path, install_command
 from dopt.log import TURN, Log, clock_unit, count_text, is_clock
 from dopt.systems.plant import Plant
-from orchestrate.program import UsageError, path, positive, tell
+from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
 
 INPUTS = re.compile(
@@ -260,20 +260,48 @@ _NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the file and the options of the command."""
+    """Add the file and the options of the command ``log``."""
     command.add_argument("file", metavar="FILE", help=".csv, .csv.gz, .parquet, .mat or .h5")
+    _add_log_options(command)
+    command.add_argument("--angles", help="states that are angles, in rad or --units: unwrapped")
+    command.add_argument("--out", type=path("--out"), help="picture (figures/NAME.png)")
+
+
+def _add_log_options(command: argparse.ArgumentParser) -> None:
+    """Add the options that say how a file becomes a log."""
     for option, what in (
-        ("--states", "measured states, such as th or angle=th,rate=om (all other columns)"),
-        ("--inputs", "inputs, such as u or voltage=u (columns that are named like inputs)"),
-        ("--angles", "states in radians that are angles: unwrapped (none)"),
+        ("--columns", "states and inputs with their columns, such as angle=th,voltage=u"),
+        ("--states", "measured states, such as th or angle=th,rate=om"),
+        ("--inputs", "inputs, such as u or voltage=u (log: columns that are named like inputs)"),
         ("--units", "units of columns, such as t=ms,th=counts/4096"),
+        ("--time", "column of the stamps (time, t, timestamp or Zeit, also with a unit)"),
     ):
         command.add_argument(option, help=what)
-    command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
-    for option, what in (("--dt", "seconds between two rows without stamps"), ("--gap", "s")):
-        help_text = what if option == "--dt" else "longest step within a piece [s] (10 medians)"
-        command.add_argument(option, type=positive(option, float), help=help_text)
-    command.add_argument("--out", type=path("--out"), help="picture (figures/NAME.png)")
+    for option, what in (
+        ("--dt", "seconds between two rows without stamps"),
+        ("--gap", "longest step within a piece [s] (10 medians)"),
+    ):
+        command.add_argument(option, type=positive(option, float), help=what)
+
+
+def _log_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what both commands give to a log, apart from the columns."""
+    units = names_of("--units", options.units) or {}
+    return {"time": options.time, "dt": options.dt, "gap": options.gap, "units": units}
+
+
+def _columns(options: argparse.Namespace) -> list[dict[str, str] | None]:
+    """Return the states and the inputs that are named, with their columns; None without."""
+    both, found = names_of("--columns", options.columns) or {}, list[dict[str, str] | None]()
+    for is_input, option in enumerate(("--states", "--inputs")):
+        kind = {
+            name: column
+            for name, column in both.items()
+            if bool(INPUTS.search(name) or INPUTS.search(column)) == is_input
+        }
+        kind |= names_of(option, getattr(options, option[2:])) or {}
+        found.append(kind or None)
+    return found
 
 
 def run(options: argparse.Namespace) -> int:
@@ -285,24 +313,17 @@ def run(options: argparse.Namespace) -> int:
             f"is expected: give one."
         )
     table = read_table(options.file).rename(columns=str)
-    states = names_of("--states", options.states)
-    angles = tuple(names_of("--angles", options.angles) or ())
-    units = names_of("--units", options.units) or {}
-    log = log_of(
-        table,
-        states,
-        names_of("--inputs", options.inputs),
-        time=options.time,
-        dt=options.dt,
-        gap=options.gap,
-        angles=angles,
-        units=units,
-    )
-    declared = {name for name, one in (states or {}).items() if one in units}
-    declared |= {*angles, *units, "" if options.dt is None else "time"}
+    states, inputs = _columns(options)
+    angles, given = tuple(names_of("--angles", options.angles) or ()), _log_options(options)
+    log = log_of(table, states, inputs, angles=angles, **given)
+    units = dict.fromkeys(angles, "rad") | given["units"]
+    named = {**(states or {}), **(inputs or {})}
+    units |= {name: units[column] for name, column in named.items() if column in units}
+    if options.dt is not None:
+        units["time"] = "s"
     health, file = examine(log), Path(options.file)
-    guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
-    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, declared)):
+    guessed = " (named like inputs: --inputs says otherwise)" * (inputs is None)
+    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, units)):
         tell(sys.stdout, f"{line}\n")
     from analysis.figures.reports import draw_log  # Matplotlib: other commands do without it
 
@@ -328,20 +349,22 @@ def names_of(option: str, text: str | None) -> dict[str, str] | None:
 
 
 def lines(
-    log: Log, health: Health, table: pd.DataFrame, declared: Collection[str] = ()
+    log: Log, health: Health, table: pd.DataFrame, units: Mapping[str, str] | None = None
 ) -> Iterator[str]:
     """Yield the sentences of the report: sampling, signals, inputs, suspicions, notes.
 
-    The units of ``declared`` states, or of the "time", are not doubted.
+    ``units`` are the ones that were declared, by state, input or "time": they are not doubted.
     """
-    told = "time" in declared or any(clock_unit(one) for one in table)
+    units = units or {}
+    told = "time" in units or any(clock_unit(one) for one in table)
     told |= any("Stamps are" in one or ": times count" in one for one in log.notes)
     yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:
-        yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
-        yield from _units(one, one.name in declared or bool(_NO_ANGLE.search(one.name)))
+        unit = _unit(units.get(one.name))
+        yield f"{one.name}{unit}: {_signal(one)}, noise at most {number(one.noise)}"
+        yield from _units(one, one.name in units or bool(_NO_ANGLE.search(one.name)))
     for one in health.inputs:
-        yield f"{one.name}: {_signal(one)}{_limits(one)}"
+        yield f"{one.name}{_unit(units.get(one.name))}: {_signal(one)}{_limits(one)}"
     wrapped = [one.name for one in health.states if not math.isnan(one.period)]
     if wrapped:
         yield f"effects of the inputs: not judged while {', '.join(wrapped)} wraps"
@@ -376,6 +399,14 @@ def _sampling(log: Log, health: Health, told: bool) -> str:
         text += f"; stamps in {likely}? A step of {number(health.step)} s is long: "
         text += f"--units time={likely}"
     return text
+
+
+def _unit(given: str | None) -> str:
+    """Return the unit that a column has in the log, and the declared one that it had before."""
+    if given is None or re.fullmatch(r"[-\d.e]+", given):
+        return f" (times {given})" if given else ""
+    unit = "rad/s" if given.endswith("/s") or given == "rpm" else "rad"
+    return f" [{unit}]" if given == unit else f" [{unit}, from {given}]"
 
 
 def _signal(one: Signal) -> str:
@@ -504,9 +535,7 @@ def add_fit_arguments(command: argparse.ArgumentParser) -> None:
         "logs", metavar="LOG", nargs="+", help=".csv, .csv.gz, .parquet, .mat, .h5"
     )
     command.add_argument("--validate", metavar="LOG", nargs="+", default=(), help="other runs")
-    command.add_argument("--columns", help="columns, such as angle=th,voltage=u (the same names)")
-    command.add_argument("--units", help="units of columns, such as t=ms,th=counts/4096")
-    command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
+    _add_log_options(command)
     command.add_argument("--width", type=int, default=16, help="units of the network, 0: none (16)")
     command.add_argument(
         "--hold",
@@ -515,7 +544,7 @@ def add_fit_arguments(command: argparse.ArgumentParser) -> None:
         help="input between two rows (zero)",
     )
     command.add_argument("--window", type=positive("--window", float), help="window [s] (chosen)")
-    command.add_argument("--out", type=path("--out"), default="fit", help="folder (fit/)")
+    command.add_argument("--out", type=folder("--out"), default="fit", help="folder (fit/)")
     command.add_argument(
         "--db",
         metavar="URL",
@@ -530,13 +559,13 @@ def run_fit(options: argparse.Namespace) -> int:
     if options.db:
         Store.open(options.db).close()  # before minutes of fitting
     plant = read_plant(options.plant)
-    given = {
-        "columns": names_of("--columns", options.columns),
-        "units": names_of("--units", options.units),
-        "time": options.time,
+    given = _log_options(options)
+    given["columns"] = {
+        name: one for kind in _columns(options) for name, one in (kind or {}).items()
     }
     logs = [_log(file, plant, given) for file in options.logs]
     tests = [_log(file, plant, given) for file in options.validate]
+    options.out.mkdir(parents=True, exist_ok=True)
     found = dopt.fit(
         plant,
         logs,
@@ -547,7 +576,6 @@ def run_fit(options: argparse.Namespace) -> int:
         progress=lambda text: tell(sys.stderr, f"{text}\n"),
     )
     tell(sys.stdout, f"{found.report()}\n")
-    options.out.mkdir(parents=True, exist_ok=True)
     found.save(options.out / "model.npz")
     tell(sys.stdout, f"model: {options.out / 'model.npz'}\n")
     if options.db:

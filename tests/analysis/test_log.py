@@ -423,6 +423,7 @@ def test_the_command_prints_and_draws(
     assert "steps of 0.00314159 (2,000 a turn)" in said
     assert "suspected delay: 0 samples" in said
     assert "in radians" not in said  # its unit was declared
+    assert "th [rad, from counts/2000]: " in said
     assert "pieces end there: row 1000" in said
     assert Path("figures/run.png").stat().st_size > 10_000
     assert cli.main(["log", "run.csv", *words, "--inputs", "u=", "--out", "a.pdf"]) == 2
@@ -430,6 +431,9 @@ def test_the_command_prints_and_draws(
     assert cli.main(["log", "none.csv"]) == 2
     assert cli.main(["log", "run.csv", "--out", "a.xyz"]) == 2
     assert "endings .png, .pdf, .svg" in capsys.readouterr().err
+    both = ["--columns", "angle=enc,motor_torque=u", "--time", "ms", "--units", "ms=ms"]
+    assert cli.main(["log", "run.csv", *both]) == 0
+    assert "states angle, inputs motor_torque" in capsys.readouterr().out
 
 
 # Recorded runs of real plants (their sources and licences: README.md in the folder of DOPT_DATA)
