@@ -356,7 +356,7 @@ def lines(
     ``units`` are the ones that were declared, by state, input or "time": they are not doubted.
     """
     units = units or {}
-    told = "time" in units or any(clock_unit(one) for one in table)
+    told = "time" in units or any(clock_unit(str(one)) for one in table)
     told |= any("Stamps are" in one or ": times count" in one for one in log.notes)
     yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:

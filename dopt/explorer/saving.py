@@ -207,7 +207,11 @@ class Explored:
 
     @property
     def constants(self) -> dict[str, float]:
-        """Constants of a plant, ``delay`` and ``lag`` [s]: first guesses, or what a refit found."""
+        """Constants of a plant, in its units, ``delay`` and ``lag`` [s].
+
+        First guesses, or what a refit found; a float each, without the error of
+        ``Fitted.constants``, which ``dopt.fit(plant, explorer.log())`` has.
+        """
         system = self._state.system
         if not isinstance(system, ExploredPlant):
             return {}

@@ -97,8 +97,8 @@ class Fitted:
     Attributes
     ----------
     constants : dict of str to (float, float)
-        Estimate and standard error of each unknown constant, of ``delay`` and ``lag`` [s]; from the
-        fit without a network.
+        Estimate and standard error of each unknown constant, in the unit of the plant, of ``delay``
+        and ``lag`` [s]; from the fit without a network. ``Explorer.constants`` has no errors.
     has_network : bool
         Whether validation wanted one.
     chosen, physics : Estimate
