@@ -140,13 +140,19 @@ def _guessed_inputs(table: pd.DataFrame) -> list[str]:
     return measured if measured and all(_COMMANDED.search(str(one)) for one in rest) else found
 
 
-def _csv(file: Path) -> pd.DataFrame:
-    names = [str(one) for one in pd.read_csv(file, nrows=0)]
+def _csv(file: Path, encoding: str = "utf-8") -> pd.DataFrame:
+    try:
+        names = [str(one) for one in pd.read_csv(file, nrows=0, encoding=encoding)]
+    except UnicodeDecodeError:
+        if encoding == "utf-8":
+            return _csv(file, "cp1252")  # of spreadsheets
+        raise
     if all(re.fullmatch(r"[-+.,;\t\de]+", one) for one in names):
         raise ValueError("its first line has numbers and no names of columns")
     mark = next((one for one in ";\t" if len(names) == 1 and one in names[0]), ",")
     decimal = "," if mark == ";" else "."
-    table = pd.read_csv(file, sep=mark, decimal=decimal, skipinitialspace=True)
+    form: Any = {"sep": mark, "decimal": decimal, "encoding": encoding}
+    table = pd.read_csv(file, skipinitialspace=True, **form)
     if not isinstance(table.index, pd.RangeIndex):  # the first values of longer rows
         if table.iloc[:, -1].notna().any():
             raise ValueError("its rows have more values than its first line has names")
@@ -255,7 +261,7 @@ UNEVEN = 0.05
 
 _MANY_TURNS = 100.0  # radians
 
-_NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)[\])]?$")
+_NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|rpm|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)[\])]?$")
 """Ends of names that say a unit which is of no angle."""
 
 

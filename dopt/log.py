@@ -40,6 +40,8 @@ _CLOCK = re.compile(
     rf"(?:time|t|timestamp|zeit)(?:(?:\s*[\[(/]|\s+in|_|\s)\s*({'|'.join(SECONDS)})\s*[\])]?)?",
     re.IGNORECASE,
 )
+_UNIT_OF_ANGLE = re.compile(r"[\[(/_ ](deg(?:/s)?|mrad(?:/s)?|rpm)[\])]?$", re.IGNORECASE)
+
 _NO_CLOCK = re.compile(r"T_.*|.*_(?:min|h)")  # a temperature, a minimum
 
 _ROLL_OVERS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
@@ -205,6 +207,8 @@ def values_of(
     """Return a column of states or inputs in the unit of the plant."""
     found = _numbers(name, values)
     if name not in units:
+        if unit := _UNIT_OF_ANGLE.search(name):
+            notes.append(f"Column {name!r} is kept in {unit[1]}: --units converts it.")
         return found
     factor = _factor(name, units[name], UNITS)
     notes.append(f"Column {name!r} is multiplied by {factor:.6g} ({units[name]}).")

@@ -389,6 +389,17 @@ def test_a_file_that_is_no_log_is_answered_by_a_sentence(
     assert "expected" in str(raised.value) or "convert it" in str(raised.value)
 
 
+def test_a_spreadsheet_of_windows_is_read(tmp_path: Path) -> None:
+    renamed = frame().rename(columns={"t": "Zeit [s]", "th": "Fühler_deg"})
+    renamed.to_csv(tmp_path / "run.csv", index=False, sep=";", decimal=",", encoding="cp1252")
+    log = analysis.read_log(tmp_path / "run.csv")
+    assert (log.states, log.notes) == (
+        ("Fühler_deg",),
+        ("Column 'Fühler_deg' is kept in deg: --units converts it.",),
+    )
+    np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
+
+
 def test_what_a_file_holds_is_said_if_it_is_no_table_or_more(tmp_path: Path) -> None:
     savemat(tmp_path / "mixed.mat", {"a": np.zeros(5), "b": np.zeros(7), "c": np.zeros(9)})
     with pytest.raises(AnalysisError, match=r"holds a \(5,\), b \(7,\), c \(9,\)"):
