@@ -491,8 +491,9 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
         about = "; about, as noise is fed back" * effect.closed_loop
         samples += f" sample{'s' * (last != 1)} of {_seconds(health.step)}"
         yield f"{pair}: suspected delay: {samples}{about}"
-    if effect.follows_state:
-        yield f"{effect.input}: closed loop, or as regular as the motion: a function of the state"
+    if effect.may_be_closed:
+        what = "a function of the state" if effect.follows_state else "its own past tells all of it"
+        yield f"{effect.input}: closed loop, or as regular as the motion: {what}"
     elif effect.closed_loop:
         yield (
             f"{effect.input}: closed loop: measurements explain {100 * effect.feedback:.0f} % of "

@@ -165,6 +165,20 @@ def test_feedback_is_found_of_an_input_that_stays_at_its_limits(seed: int, gain:
     assert one_effect(np.array(seen), np.array(u)).closed_loop == bool(gain)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_smooth_input_of_a_controller_is_not_called_open_loop(seed: int) -> None:
+    """Its past tells all of it but the last digit: a cylinder with a fine scale."""
+    rng = np.random.default_rng(seed)
+    place, speed, seen, u = 0.1, 0.0, [], []
+    for wanted in np.repeat(rng.uniform(0.05, 0.25, 20), 200):
+        seen.append(round((place + 1e-4 * rng.normal()) / 1e-4) * 1e-4)
+        u.append(round(float(np.clip(40 * (wanted - seen[-1]), -8, 8)), 2))
+        for _ in range(10):
+            place, speed = place + 1e-3 * speed, speed + 1e-3 * 60 * (0.06 * u[-1] - speed)
+    effect = one_effect(np.array(seen), np.array(u), "x")
+    assert effect.closed_loop or effect.may_be_closed
+
+
 @pytest.mark.parametrize("slower", [2, 3, 10])
 def test_a_slow_sensor_beside_a_fast_one_is_no_defect(slower: int) -> None:
     """Where no two rows that follow each other have all states, no effect is judged."""
