@@ -298,16 +298,15 @@ def _log_options(options: argparse.Namespace) -> dict[str, Any]:
 
 def _columns(options: argparse.Namespace) -> list[dict[str, str] | None]:
     """Return the states and the inputs that are named, with their columns; None without."""
-    both, found = names_of("--columns", options.columns) or {}, list[dict[str, str] | None]()
-    for is_input, option in enumerate(("--states", "--inputs")):
-        kind = {
-            name: column
-            for name, column in both.items()
-            if bool(INPUTS.search(name) or INPUTS.search(column)) == is_input
-        }
-        kind |= names_of(option, getattr(options, option[2:])) or {}
-        found.append(kind or None)
-    return found
+    both, *own = (names_of(one, getattr(options, one[2:])) or {} for one in _NAMING)
+    kinds: list[dict[str, str]] = [{}, {}]
+    for name, column in both.items():
+        if name not in {**own[0], **own[1]}:
+            kinds[bool(INPUTS.search(name) or INPUTS.search(column))][name] = column
+    return [{**kind, **named} or None for kind, named in zip(kinds, own, strict=True)]
+
+
+_NAMING = ("--columns", "--states", "--inputs")
 
 
 def run(options: argparse.Namespace) -> int:

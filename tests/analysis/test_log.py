@@ -459,6 +459,8 @@ def test_the_command_prints_and_draws(
     both = ["--columns", "angle=enc,motor_torque=u", "--time", "ms", "--units", "ms=ms"]
     assert cli.main(["log", "run.csv", *both]) == 0
     assert "states angle, inputs motor_torque" in capsys.readouterr().out
+    assert cli.main(["log", "run.csv", *both, "--inputs", "motor_torque=u"]) == 0
+    assert "states angle, inputs motor_torque" in capsys.readouterr().out
 
 
 # Recorded runs of real plants (their sources and licences: README.md in the folder of DOPT_DATA)
