@@ -22,7 +22,7 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import TURN, Log, clock_unit, count_text, is_clock
+from dopt.log import TURN, UNIT_OF_ANGLE, Log, clock_unit, count_text, is_clock
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
@@ -261,7 +261,7 @@ UNEVEN = 0.05
 
 _MANY_TURNS = 100.0  # radians
 
-_NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|rpm|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)[\])]?$")
+_NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)[\])]?$")
 """Ends of names that say a unit which is of no angle."""
 
 
@@ -322,8 +322,11 @@ def run(options: argparse.Namespace) -> int:
     angles, given = tuple(names_of("--angles", options.angles) or ()), _log_options(options)
     log = log_of(table, states, inputs, angles=angles, **given)
     units = dict.fromkeys(angles, "rad") | given["units"]
-    named = {**(states or {}), **(inputs or {})}
-    units |= {name: units[column] for name, column in named.items() if column in units}
+    for name, column in {**(states or {}), **(inputs or {})}.items():
+        if column in units:
+            units[name] = units[column]
+        elif name != column and (unit := _NO_ANGLE.search(column)):
+            units.setdefault(name, unit[1])
     if options.dt is not None:
         units["time"] = "s"
     health, file = examine(log), Path(options.file)
@@ -367,7 +370,8 @@ def lines(
     for one in health.states:
         unit = _unit(units.get(one.name))
         yield f"{one.name}{unit}: {_signal(one)}, noise at most {number(one.noise)}"
-        yield from _units(one, one.name in units or bool(_NO_ANGLE.search(one.name)))
+        named = _NO_ANGLE.search(one.name) or UNIT_OF_ANGLE.search(one.name)
+        yield from _units(one, one.name in units or bool(named))
     for one in health.inputs:
         yield f"{one.name}{_unit(units.get(one.name))}: {_signal(one)}{_limits(one)}"
     wrapped = [one.name for one in health.states if not math.isnan(one.period)]
@@ -410,6 +414,8 @@ def _unit(given: str | None) -> str:
     """Return the unit that a column has in the log, and the declared one that it had before."""
     if given is None or re.fullmatch(r"[-\d.e]+", given):
         return f" (times {given})" if given else ""
+    if _NO_ANGLE.fullmatch(f"_{given}"):
+        return f" [{given}]"
     unit = "rad/s" if given.endswith("/s") or given == "rpm" else "rad"
     return f" [{unit}]" if given == unit else f" [{unit}, from {given}]"
 

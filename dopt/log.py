@@ -40,7 +40,7 @@ _CLOCK = re.compile(
     rf"(?:time|t|timestamp|zeit)(?:(?:\s*[\[(/]|\s+in|_|\s)\s*({'|'.join(SECONDS)})\s*[\])]?)?",
     re.IGNORECASE,
 )
-_UNIT_OF_ANGLE = re.compile(r"[\[(/_ ](deg(?:/s)?|mrad(?:/s)?|rpm)[\])]?$", re.IGNORECASE)
+UNIT_OF_ANGLE = re.compile(r"[\[(/_ ](deg(?:/s)?|mrad(?:/s)?|rpm)[\])]?$", re.IGNORECASE)
 
 _NO_CLOCK = re.compile(r"T_.*|.*_(?:min|h)")  # a temperature, a minimum
 
@@ -207,7 +207,7 @@ def values_of(
     """Return a column of states or inputs in the unit of the plant."""
     found = _numbers(name, values)
     if name not in units:
-        if unit := _UNIT_OF_ANGLE.search(name):
+        if unit := UNIT_OF_ANGLE.search(name):
             notes.append(f"Column {name!r} is kept in {unit[1]}: --units converts it.")
         return found
     factor = _factor(name, units[name], UNITS)

@@ -456,6 +456,14 @@ def test_the_command_prints_and_draws(
     assert cli.main(["log", "none.csv"]) == 2
     assert cli.main(["log", "run.csv", "--out", "a.xyz"]) == 2
     assert "endings .png, .pdf, .svg" in capsys.readouterr().err
+    named = table.rename(columns={"ms": "Zeit [ms]", "enc": "level [mm]", "u": "u_rpm"})
+    named.to_csv("named.csv", index=False)
+    assert cli.main(["log", "named.csv", "--columns", "level=level [mm],u=u_rpm"]) == 0
+    said = capsys.readouterr().out
+    assert "level [mm]: " in said
+    assert "u: " in said
+    assert "'u_rpm' is kept in rpm: --units converts it" in said
+    assert "degrees" not in said
     both = ["--columns", "angle=enc,motor_torque=u", "--time", "ms", "--units", "ms=ms"]
     assert cli.main(["log", "run.csv", *both]) == 0
     assert "states angle, inputs motor_torque" in capsys.readouterr().out
