@@ -22,7 +22,7 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import TURN, UNIT_OF_ANGLE, Log, clock_unit, count_text, is_clock
+from dopt.log import TURN, UNIT_OF_ANGLE, Log, clock_unit, count_text
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
@@ -118,7 +118,7 @@ def log_of(
         states = [
             one
             for one in map(str, table)
-            if one not in taken and not is_clock(one) and not one.startswith("Unnamed: ")
+            if one not in taken and clock_unit(one) is None and not one.startswith("Unnamed: ")
             if not is_flag(table[one]) and not INPUTS.search(one)
         ]
     log = Log(table, states=states, inputs=inputs, **options)
@@ -151,8 +151,7 @@ def _csv(file: Path, encoding: str = "utf-8") -> pd.DataFrame:
         raise ValueError("its first line has numbers and no names of columns")
     mark = next((one for one in ";\t" if len(names) == 1 and one in names[0]), ",")
     decimal = "," if mark == ";" else "."
-    form: Any = {"sep": mark, "decimal": decimal, "encoding": encoding}
-    table = pd.read_csv(file, skipinitialspace=True, **form)
+    table = pd.read_csv(file, sep=mark, decimal=decimal, encoding=encoding, skipinitialspace=True)
     if not isinstance(table.index, pd.RangeIndex):  # the first values of longer rows
         if table.iloc[:, -1].notna().any():
             raise ValueError("its rows have more values than its first line has names")
@@ -275,38 +274,26 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def _add_log_options(command: argparse.ArgumentParser) -> None:
     """Add the options that say how a file becomes a log."""
-    for option, what in (
-        ("--columns", "states and inputs with their columns, such as angle=th,voltage=u"),
-        ("--states", "measured states, such as th or angle=th,rate=om"),
-        ("--inputs", "inputs, such as u or voltage=u (log: columns that are named like inputs)"),
-        ("--units", "units of columns, such as t=ms,th=counts/4096"),
-        ("--time", "column of the stamps (time, t, timestamp or Zeit, also with a unit)"),
+    for option, kind, what in (
+        ("--columns", str, "states and inputs with their columns, such as angle=th,voltage=u"),
+        ("--states", str, "measured states, such as th or angle=th,rate=om"),
+        ("--inputs", str, "inputs, such as u or voltage=u (log: what is named like an input)"),
+        ("--units", str, "units of columns, such as t=ms,th=counts/4096"),
+        ("--time", str, "column of the stamps (time, t, timestamp or Zeit, also with a unit)"),
+        ("--dt", positive("--dt", float), "seconds between two rows without stamps"),
+        ("--gap", positive("--gap", float), "longest step within a piece [s] (10 medians)"),
     ):
-        command.add_argument(option, help=what)
-    for option, what in (
-        ("--dt", "seconds between two rows without stamps"),
-        ("--gap", "longest step within a piece [s] (10 medians)"),
-    ):
-        command.add_argument(option, type=positive(option, float), help=what)
+        command.add_argument(option, type=kind, help=what)
 
 
-def _log_options(options: argparse.Namespace) -> dict[str, Any]:
-    """Return what both commands give to a log, apart from the columns."""
-    units = names_of("--units", options.units) or {}
-    return {"time": options.time, "dt": options.dt, "gap": options.gap, "units": units}
-
-
-def _columns(options: argparse.Namespace) -> list[dict[str, str] | None]:
-    """Return the states and the inputs that are named, with their columns; None without."""
-    both, *own = (names_of(one, getattr(options, one[2:])) or {} for one in _NAMING)
-    kinds: list[dict[str, str]] = [{}, {}]
+def _log_options(options: argparse.Namespace) -> tuple[dict[str, Any], list[dict[str, str]]]:
+    """Return what both commands give to a log, and its states and inputs with their columns."""
+    names = ("--columns", "--states", "--inputs", "--units")
+    both, *own, units = (names_of(one, getattr(options, one[2:])) for one in names)
     for name, column in both.items():
         if name not in {**own[0], **own[1]}:
-            kinds[bool(INPUTS.search(name) or INPUTS.search(column))][name] = column
-    return [{**kind, **named} or None for kind, named in zip(kinds, own, strict=True)]
-
-
-_NAMING = ("--columns", "--states", "--inputs")
+            own[bool(INPUTS.search(name) or INPUTS.search(column))][name] = column
+    return {"time": options.time, "dt": options.dt, "gap": options.gap, "units": units}, own
 
 
 def run(options: argparse.Namespace) -> int:
@@ -318,11 +305,11 @@ def run(options: argparse.Namespace) -> int:
             f"is expected: give one."
         )
     table = read_table(options.file).rename(columns=str)
-    states, inputs = _columns(options)
-    angles, given = tuple(names_of("--angles", options.angles) or ()), _log_options(options)
-    log = log_of(table, states, inputs, angles=angles, **given)
+    given, (states, inputs) = _log_options(options)
+    angles = (*names_of("--angles", options.angles),)
+    log = log_of(table, states or None, inputs or None, angles=angles, **given)
     units = dict.fromkeys(angles, "rad") | given["units"]
-    for name, column in {**(states or {}), **(inputs or {})}.items():
+    for name, column in {**states, **inputs}.items():
         if column in units:
             units[name] = units[column]
         elif name != column and (unit := _NO_ANGLE.search(column)):
@@ -330,7 +317,7 @@ def run(options: argparse.Namespace) -> int:
     if options.dt is not None:
         units["time"] = "s"
     health, file = examine(log), Path(options.file)
-    guessed = " (named like inputs: --inputs says otherwise)" * (inputs is None)
+    guessed = " (named like inputs: --inputs says otherwise)" * (not inputs)
     for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, units)):
         tell(sys.stdout, f"{line}\n")
     from analysis.figures.reports import draw_log  # Matplotlib: other commands do without it
@@ -340,12 +327,10 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def names_of(option: str, text: str | None) -> dict[str, str] | None:
+def names_of(option: str, text: str | None) -> dict[str, str]:
     """Return the columns that an option names, by state or input."""
-    if text is None:
-        return None
     found = {}
-    for part in text.split(","):
+    for part in text.split(",") if text is not None else ():
         name, equals, column = (one.strip() for one in part.partition("="))
         if not name or (equals and not column) or (option == "--units" and not equals):
             raise UsageError(
@@ -543,25 +528,15 @@ FIT_HELP = "fit a plant's unknown constants and a network to recorded runs: repo
 def add_fit_arguments(command: argparse.ArgumentParser) -> None:
     """Add the files and the options of the command."""
     command.add_argument("plant", metavar="PLANT", help="the arguments of dopt.Plant (.yaml)")
-    command.add_argument(
-        "logs", metavar="LOG", nargs="+", help=".csv, .csv.gz, .parquet, .mat, .h5"
-    )
+    command.add_argument("logs", metavar="LOG", nargs="+", help="files as the command log reads")
     command.add_argument("--validate", metavar="LOG", nargs="+", default=(), help="other runs")
     _add_log_options(command)
     command.add_argument("--width", type=int, default=16, help="units of the network, 0: none (16)")
-    command.add_argument(
-        "--hold",
-        choices=("zero", "linear", "cubic"),
-        default="zero",
-        help="input between two rows (zero)",
-    )
+    holds = ("zero", "linear", "cubic")
+    command.add_argument("--hold", choices=holds, default="zero", help="input between rows (zero)")
     command.add_argument("--window", type=positive("--window", float), help="window [s] (chosen)")
     command.add_argument("--out", type=folder("--out"), default="fit", help="folder (fit/)")
-    command.add_argument(
-        "--db",
-        metavar="URL",
-        help="database that stores the fit, such as sqlite:///results.db (no database)",
-    )
+    command.add_argument("--db", metavar="URL", help="stores the fit: sqlite:///results.db (none)")
 
 
 def run_fit(options: argparse.Namespace) -> int:
@@ -571,10 +546,8 @@ def run_fit(options: argparse.Namespace) -> int:
     if options.db:
         Store.open(options.db).close()  # before minutes of fitting
     plant = read_plant(options.plant)
-    given = _log_options(options)
-    given["columns"] = {
-        name: one for kind in _columns(options) for name, one in (kind or {}).items()
-    }
+    given, (states, inputs) = _log_options(options)
+    given["columns"] = {**states, **inputs}
     logs = [_log(file, plant, given) for file in options.logs]
     tests = [_log(file, plant, given) for file in options.validate]
     options.out.mkdir(parents=True, exist_ok=True)

@@ -37,12 +37,11 @@ SECONDS |= {"min": 60.0, "h": 3600.0}
 """Units of time [s]."""
 
 _CLOCK = re.compile(
-    rf"(?:time|t|timestamp|zeit)(?:(?:\s*[\[(/]|\s+in|_|\s)\s*({'|'.join(SECONDS)})\s*[\])]?)?",
+    r"(?!(?-i:T)_|.*_(?:min|h)$)(?:time|t|timestamp|zeit)"  # no temperature, no minimum
+    rf"(?:(?:\s*[\[(/]|\s+in|_|\s)\s*({'|'.join(SECONDS)})\s*[\])]?)?",
     re.IGNORECASE,
 )
 UNIT_OF_ANGLE = re.compile(r"[\[(/_ ](deg(?:/s)?|mrad(?:/s)?|rpm)[\])]?$", re.IGNORECASE)
-
-_NO_CLOCK = re.compile(r"T_.*|.*_(?:min|h)")  # a temperature, a minimum
 
 _ROLL_OVERS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
 """Times after which a 32-bit counter of µs or ms begins again [s]."""
@@ -54,17 +53,9 @@ _DATE = re.compile(
 )
 
 
-def is_clock(name: str) -> bool:
-    return clock_unit(name) is not None
-
-
 def clock_unit(name: str) -> str | None:
-    """Return the unit in the name of a clock, such as ``run.t`` or ``Zeit [ms]``, "" without one.
-
-    It is None of a column that is not called so.
-    """
-    last = name.strip().rsplit(".", 1)[-1]
-    found = None if _NO_CLOCK.fullmatch(last) else _CLOCK.fullmatch(last)
+    """Return the unit in the name of a clock, "" in ``run.t``; None of what is called otherwise."""
+    found = _CLOCK.fullmatch(name.strip().rsplit(".", 1)[-1])
     return found and (found[1] or "").lower()
 
 
@@ -114,8 +105,8 @@ def clock_column(
     table: Mapping[str, Any], taken: Collection[str], time: Any, dt: float | None, notes: list[str]
 ) -> str | None:
     """Return the name of the column of the stamps, None where they are given or made of dt."""
-    clocks = {name: clock_unit(name) for name in table if is_clock(name) and name not in taken}
-    found = [name for name, unit in clocks.items() if not unit] or [*clocks]
+    clocks = [name for name in table if clock_unit(name) is not None and name not in taken]
+    found = [name for name in clocks if not clock_unit(name)] or clocks
     if time is not None and dt is not None:
         raise SpecificationError(
             f"a log has the time {time if isinstance(time, str) else 'of an array'!r} and dt = "
@@ -208,7 +199,7 @@ def values_of(
     found = _numbers(name, values)
     if name not in units:
         if unit := UNIT_OF_ANGLE.search(name):
-            notes.append(f"Column {name!r} is kept in {unit[1]}: --units converts it.")
+            notes.append(f"Column {name!r} is kept in {unit[1]}: units= or --units converts it.")
         return found
     factor = _factor(name, units[name], UNITS)
     notes.append(f"Column {name!r} is multiplied by {factor:.6g} ({units[name]}).")
@@ -506,10 +497,10 @@ class Log:
             )
         notes = []
         taken = {*found.values(), *(renamed.get(name, name) for name in plant.inputs)}
-        if time is None and dt is None and not any(map(is_clock, {*table} - taken)):
+        if time is None and dt is None and {*map(clock_unit, {*table} - taken)} <= {None}:
             dt = float(plant.dt)
             notes.append(
-                f"No column of stamps (--time): rows are the plant's dt of {dt:g} s apart (--dt)."
+                f"No column of stamps (--time): rows are the plant's dt of {dt:g} s apart."
             )
         log = cls(
             table,

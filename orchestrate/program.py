@@ -220,21 +220,13 @@ def path(option: str) -> Callable[[str], Path]:
     return partial(given_path, what=option, refusal=UsageError)
 
 
-FILES = (".csv", ".gif", ".html", ".md", ".mp4", ".npz", ".pdf", ".png", ".svg")
-"""Endings of what commands write into a folder, with which a folder's name seldom ends."""
-
-
 def folder(option: str) -> Callable[[str], Path]:
-    """Return the argument type for the path of a folder that files are written into."""
+    """Return the argument type for the path of a folder, which is not named like a file."""
 
     def read(given: str) -> Path:
-        found = path(option)(given)
-        if found.is_file() or (found.suffix.lower() in FILES and not found.is_dir()):
-            raise UsageError(
-                f"{option} is {given!r}, but a folder is expected, into which the files are "
-                f"written under their own names: give one."
-            )
-        return found
+        if given.endswith((".csv", ".html", ".npz", ".pdf", ".png", ".svg")):
+            raise UsageError(f"{option} is {given!r}, but a folder is expected: give one.")
+        return path(option)(given)
 
     return read
 

@@ -207,11 +207,7 @@ class Explored:
 
     @property
     def constants(self) -> dict[str, float]:
-        """Constants of a plant, in its units, ``delay`` and ``lag`` [s].
-
-        First guesses, or what a refit found; a float each, without the error of
-        ``Fitted.constants``, which ``dopt.fit(plant, explorer.log())`` has.
-        """
+        """Constants of a plant, ``delay``, ``lag`` [s]: guesses, or a refit's, without errors."""
         system = self._state.system
         if not isinstance(system, ExploredPlant):
             return {}

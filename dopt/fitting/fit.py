@@ -60,9 +60,6 @@ BLOCKS = 5
 LENGTHS = (0.2, 0.4, 0.8, 1.6)
 """Lengths of windows that are tried, by the time scale of the log."""
 
-SHORT = 0.4
-"""Longest window, by the time scale of the log, below which the log is called short."""
-
 FEWEST_ROWS = 12
 """Fewest rows of a window."""
 
@@ -248,15 +245,13 @@ class _Selection:
                 f"{longest:g} s, but at least {2 * least:g} s, {2 * FEWEST_ROWS} samples, are "
                 f"expected: give longer runs."
             )
-        fitting = fitting or [least]
-        if fitting[-1] < SHORT * self.scale:
-            wanted = 4.0 * BLOCKS * LENGTHS[-2] * self.scale
+        if (fitting or [least])[-1] < LENGTHS[1] * self.scale:
             self.notes.append(
-                f"the log is short: windows of {fitting[-1]:.2g} s are the longest that its parts "
-                f"let be tried, a period of the motion is about {self.scale:.2g} s: record "
-                f"{wanted:.2g} s or more"
+                f"the log is short: windows of {(fitting or [least])[-1]:.2g} s are the longest "
+                f"that it lets be tried, a period of the motion is about {self.scale:.2g} s: "
+                f"record {4.0 * BLOCKS * LENGTHS[-2] * self.scale:.2g} s or more"
             )
-        return fitting
+        return fitting or [least]
 
     def _longest_block(self) -> float:
         """Return the longest time of a block without a gap [s]."""

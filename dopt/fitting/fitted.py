@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -348,7 +349,7 @@ class Fitted:
         judged, useful = self._judged(), self.useful()
         if not judged:
             return "Not judged: no run is long enough, or moves beyond its noise, to be predicted."
-        enough = [horizon for horizon, (count, _) in judged.items() if count >= FEWEST]
+        enough = {horizon: count for horizon, (count, _) in judged.items() if count >= FEWEST}
         if not enough:
             most = count_text(max(count for count, _ in judged.values()), "prediction")
             return f"Not judged: {most} at most, but {FEWEST} are expected: give longer runs."
@@ -356,18 +357,14 @@ class Fitted:
             return "Do not use this model: it predicts no better than that nothing changes."
         if useful < max(enough):
             return f"Do not use this model beyond {useful:.2g} s."
-        count = judged[useful][0]
-        return f"Useful up to {useful:.2g} s, the longest time judged, by {count} predictions."
+        how = f"the longest time judged, by {enough[useful]} predictions"
+        return f"Useful up to {useful:.2g} s, {how}."
 
     def useful(self) -> float:
         """Return how far ahead the model is worth using [s]; 0 for not at all, or not judged."""
-        useful = 0.0
-        for horizon, (count, is_good) in self._judged().items():
-            if count >= FEWEST:
-                if not is_good:
-                    break
-                useful = horizon
-        return useful
+        judged = self._judged().items()
+        enough = [(horizon, is_good) for horizon, (count, is_good) in judged if count >= FEWEST]
+        return max((each[0] for each in itertools.takewhile(lambda one: one[1], enough)), default=0)
 
     def _judged(self) -> dict[float, tuple[int, bool]]:
         """Return, by the time ahead [s], the number of predictions and whether all are good."""

@@ -409,7 +409,7 @@ def test_a_spreadsheet_of_windows_is_read(tmp_path: Path) -> None:
     log = analysis.read_log(tmp_path / "run.csv")
     assert (log.states, log.notes) == (
         ("Fühler_deg",),
-        ("Column 'Fühler_deg' is kept in deg: --units converts it.",),
+        ("Column 'Fühler_deg' is kept in deg: units= or --units converts it.",),
     )
     np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
 
@@ -462,7 +462,7 @@ def test_the_command_prints_and_draws(
     said = capsys.readouterr().out
     assert "level [mm]: " in said
     assert "u: " in said
-    assert "'u_rpm' is kept in rpm: --units converts it" in said
+    assert "'u_rpm' is kept in rpm: units= or --units converts it" in said
     assert "degrees" not in said
     both = ["--columns", "angle=enc,motor_torque=u", "--time", "ms", "--units", "ms=ms"]
     assert cli.main(["log", "run.csv", *both]) == 0
