@@ -7,6 +7,7 @@ has a report, a picture and a model.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
 import re
@@ -140,13 +141,15 @@ def _guessed_inputs(table: pd.DataFrame) -> list[str]:
     return measured if measured and all(_COMMANDED.search(str(one)) for one in rest) else found
 
 
-def _csv(file: Path, encoding: str = "utf-8") -> pd.DataFrame:
-    try:
-        names = [str(one) for one in pd.read_csv(file, nrows=0, encoding=encoding)]
-    except UnicodeDecodeError:
-        if encoding == "utf-8":
-            return _csv(file, "cp1252")  # of spreadsheets
-        raise
+def _csv(file: Path) -> pd.DataFrame:
+    for encoding in ("utf-8", "utf-16"):
+        with contextlib.suppress(UnicodeError):
+            return _csv_in(file, encoding)
+    return _csv_in(file, "cp1252")  # of spreadsheets
+
+
+def _csv_in(file: Path, encoding: str) -> pd.DataFrame:
+    names = [str(one) for one in pd.read_csv(file, nrows=0, encoding=encoding)]
     if all(re.fullmatch(r"[-+.,;\t\de]+", one) for one in names):
         raise ValueError("its first line has numbers and no names of columns")
     mark = next((one for one in ";\t" if len(names) == 1 and one in names[0]), ",")

@@ -403,9 +403,10 @@ def test_a_file_that_is_no_log_is_answered_by_a_sentence(
     assert "expected" in str(raised.value) or "convert it" in str(raised.value)
 
 
-def test_a_spreadsheet_of_windows_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig"])
+def test_a_spreadsheet_of_windows_is_read(encoding: str, tmp_path: Path) -> None:
     renamed = frame().rename(columns={"t": "Zeit [s]", "th": "Fühler_deg"})
-    renamed.to_csv(tmp_path / "run.csv", index=False, sep=";", decimal=",", encoding="cp1252")
+    renamed.to_csv(tmp_path / "run.csv", index=False, sep=";", decimal=",", encoding=encoding)
     log = analysis.read_log(tmp_path / "run.csv")
     assert (log.states, log.notes) == (
         ("Fühler_deg",),
