@@ -37,7 +37,7 @@ from analysis.tables.rendering import (
 )
 from dopt.errors import install_command
 from dopt.result import Assessment
-from orchestrate.program import Parser, answered, path, positive, tell
+from orchestrate.program import Parser, answered, folder, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, Store, default_url
 
 COLUMNS = ("loss", "reachable_loss")
@@ -75,7 +75,7 @@ def parser() -> Parser:
     top = Parser(prog="python -m analysis", description=__doc__)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     figures = _command(commands, "figures", _figures, "draw the paper's figures and tables")
-    figures.add_argument("--out", type=path("--out"), default="figures", help="folder (figures/)")
+    figures.add_argument("--out", type=folder("--out"), default="figures", help="folder (figures/)")
     figures.add_argument("--only", action="append", choices=NAMES, help="this output (repeat)")
     figures.add_argument(
         "--x", dest="axis", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1"
@@ -137,7 +137,7 @@ def parser() -> Parser:
             metavar="KEY",
             help="settings of which each value is shown once, such as width or env.gamma (policy)",
         )
-    compared.add_argument("--out", type=path("--out"), default="report", help="folder (report/)")
+    compared.add_argument("--out", type=folder("--out"), default="report", help="folder (report/)")
     film = "a film of one stored trial: system, phase trace, learned and true force, loss"
     animate = commands.add_parser("animate", help=film, description=film)
     animate.set_defaults(run=_animate, allow_partial=True)

@@ -122,6 +122,11 @@ class Effect:
         most = ROUNDED if self.feedback > SURE else PREDICTED
         return self.follows_state or (feedback and self.predicted < most)
 
+    @property
+    def may_be_closed(self) -> bool:
+        """Whether feedback and an input as regular as the motion are not told apart."""
+        return self.follows_state or (self.feedback > BETWEEN and not self.closed_loop)
+
 
 def effects(log: Log) -> list[Effect]:
     """Return the effect of each input that varies; none where the pieces are too short."""

@@ -7,11 +7,12 @@ has a report, a picture and a model.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import TURN, Log, count_text, is_clock
+from dopt.log import TURN, UNIT_OF_ANGLE, Log, clock_unit, count_text
 from dopt.systems.plant import Plant
-from orchestrate.program import UsageError, path, positive, tell
+from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
 
 INPUTS = re.compile(
@@ -118,7 +119,7 @@ def log_of(
         states = [
             one
             for one in map(str, table)
-            if one not in taken and not is_clock(one) and not one.startswith("Unnamed: ")
+            if one not in taken and clock_unit(one) is None and not one.startswith("Unnamed: ")
             if not is_flag(table[one]) and not INPUTS.search(one)
         ]
     log = Log(table, states=states, inputs=inputs, **options)
@@ -141,12 +142,19 @@ def _guessed_inputs(table: pd.DataFrame) -> list[str]:
 
 
 def _csv(file: Path) -> pd.DataFrame:
-    names = [str(one) for one in pd.read_csv(file, nrows=0)]
+    for encoding in ("utf-8", "utf-16"):
+        with contextlib.suppress(UnicodeError):
+            return _csv_in(file, encoding)
+    return _csv_in(file, "cp1252")  # of spreadsheets
+
+
+def _csv_in(file: Path, encoding: str) -> pd.DataFrame:
+    names = [str(one) for one in pd.read_csv(file, nrows=0, encoding=encoding)]
     if all(re.fullmatch(r"[-+.,;\t\de]+", one) for one in names):
         raise ValueError("its first line has numbers and no names of columns")
     mark = next((one for one in ";\t" if len(names) == 1 and one in names[0]), ",")
     decimal = "," if mark == ";" else "."
-    table = pd.read_csv(file, sep=mark, decimal=decimal, skipinitialspace=True)
+    table = pd.read_csv(file, sep=mark, decimal=decimal, encoding=encoding, skipinitialspace=True)
     if not isinstance(table.index, pd.RangeIndex):  # the first values of longer rows
         if table.iloc[:, -1].notna().any():
             raise ValueError("its rows have more values than its first line has names")
@@ -260,20 +268,35 @@ _NO_ANGLE = re.compile(r"[\[(/_ ](°C|degC|[kcm]?m|m?[AVK]|k?N|k?Pa|m?bar|k?g|%)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the file and the options of the command."""
+    """Add the file and the options of the command ``log``."""
     command.add_argument("file", metavar="FILE", help=".csv, .csv.gz, .parquet, .mat or .h5")
-    for option, what in (
-        ("--states", "measured states, such as th or angle=th,rate=om (all other columns)"),
-        ("--inputs", "inputs, such as u or voltage=u (columns that are named like inputs)"),
-        ("--angles", "states in radians that are angles: unwrapped (none)"),
-        ("--units", "units of columns, such as t=ms,th=counts/4096"),
-    ):
-        command.add_argument(option, help=what)
-    command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
-    for option, what in (("--dt", "seconds between two rows without stamps"), ("--gap", "s")):
-        help_text = what if option == "--dt" else "longest step within a piece [s] (10 medians)"
-        command.add_argument(option, type=positive(option, float), help=help_text)
+    _add_log_options(command)
+    command.add_argument("--angles", help="states that are angles, in rad or --units: unwrapped")
     command.add_argument("--out", type=path("--out"), help="picture (figures/NAME.png)")
+
+
+def _add_log_options(command: argparse.ArgumentParser) -> None:
+    """Add the options that say how a file becomes a log."""
+    for option, kind, what in (
+        ("--columns", str, "states and inputs with their columns, such as angle=th,voltage=u"),
+        ("--states", str, "measured states, such as th or angle=th,rate=om"),
+        ("--inputs", str, "inputs, such as u or voltage=u (log: what is named like an input)"),
+        ("--units", str, "units of columns, such as t=ms,th=counts/4096"),
+        ("--time", str, "column of the stamps (time, t, timestamp or Zeit, also with a unit)"),
+        ("--dt", positive("--dt", float), "seconds between two rows without stamps"),
+        ("--gap", positive("--gap", float), "longest step within a piece [s] (10 medians)"),
+    ):
+        command.add_argument(option, type=kind, help=what)
+
+
+def _log_options(options: argparse.Namespace) -> tuple[dict[str, Any], list[dict[str, str]]]:
+    """Return what both commands give to a log, and its states and inputs with their columns."""
+    names = ("--columns", "--states", "--inputs", "--units")
+    both, *own, units = (names_of(one, getattr(options, one[2:])) for one in names)
+    for name, column in both.items():
+        if name not in {**own[0], **own[1]}:
+            own[bool(INPUTS.search(name) or INPUTS.search(column))][name] = column
+    return {"time": options.time, "dt": options.dt, "gap": options.gap, "units": units}, own
 
 
 def run(options: argparse.Namespace) -> int:
@@ -285,24 +308,20 @@ def run(options: argparse.Namespace) -> int:
             f"is expected: give one."
         )
     table = read_table(options.file).rename(columns=str)
-    states = names_of("--states", options.states)
-    angles = tuple(names_of("--angles", options.angles) or ())
-    units = names_of("--units", options.units) or {}
-    log = log_of(
-        table,
-        states,
-        names_of("--inputs", options.inputs),
-        time=options.time,
-        dt=options.dt,
-        gap=options.gap,
-        angles=angles,
-        units=units,
-    )
-    declared = {name for name, one in (states or {}).items() if one in units}
-    declared |= {*angles, *units, "" if options.dt is None else "time"}
+    given, (states, inputs) = _log_options(options)
+    angles = (*names_of("--angles", options.angles),)
+    log = log_of(table, states or None, inputs or None, angles=angles, **given)
+    units = dict.fromkeys(angles, "rad") | given["units"]
+    for name, column in {**states, **inputs}.items():
+        if column in units:
+            units[name] = units[column]
+        elif name != column and (unit := _NO_ANGLE.search(column)):
+            units.setdefault(name, unit[1])
+    if options.dt is not None:
+        units["time"] = "s"
     health, file = examine(log), Path(options.file)
-    guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
-    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, declared)):
+    guessed = " (named like inputs: --inputs says otherwise)" * (not inputs)
+    for line in (f"{file.name}: {log!r}{guessed}", *lines(log, health, table, units)):
         tell(sys.stdout, f"{line}\n")
     from analysis.figures.reports import draw_log  # Matplotlib: other commands do without it
 
@@ -311,12 +330,10 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def names_of(option: str, text: str | None) -> dict[str, str] | None:
+def names_of(option: str, text: str | None) -> dict[str, str]:
     """Return the columns that an option names, by state or input."""
-    if text is None:
-        return None
     found = {}
-    for part in text.split(","):
+    for part in text.split(",") if text is not None else ():
         name, equals, column = (one.strip() for one in part.partition("="))
         if not name or (equals and not column) or (option == "--units" and not equals):
             raise UsageError(
@@ -328,21 +345,23 @@ def names_of(option: str, text: str | None) -> dict[str, str] | None:
 
 
 def lines(
-    log: Log, health: Health, table: pd.DataFrame, declared: Collection[str] = ()
+    log: Log, health: Health, table: pd.DataFrame, units: Mapping[str, str] | None = None
 ) -> Iterator[str]:
     """Yield the sentences of the report: sampling, signals, inputs, suspicions, notes.
 
-    The units of ``declared`` states, or of the "time", are not doubted.
+    ``units`` are the ones that were declared, by state, input or "time": they are not doubted.
     """
-    told = "time" in declared or any(
-        "Stamps are" in one or ": times count" in one for one in log.notes
-    )
+    units = units or {}
+    told = "time" in units or any(clock_unit(str(one)) for one in table)
+    told |= any("Stamps are" in one or ": times count" in one for one in log.notes)
     yield f"sampling: {_sampling(log, health, told)}"
     for one in health.states:
-        yield f"{one.name}: {_signal(one)}, noise at most {number(one.noise)}"
-        yield from _units(one, one.name in declared or bool(_NO_ANGLE.search(one.name)))
+        unit = _unit(units.get(one.name))
+        yield f"{one.name}{unit}: {_signal(one)}, noise at most {number(one.noise)}"
+        named = _NO_ANGLE.search(one.name) or UNIT_OF_ANGLE.search(one.name)
+        yield from _units(one, one.name in units or bool(named))
     for one in health.inputs:
-        yield f"{one.name}: {_signal(one)}{_limits(one)}"
+        yield f"{one.name}{_unit(units.get(one.name))}: {_signal(one)}{_limits(one)}"
     wrapped = [one.name for one in health.states if not math.isnan(one.period)]
     if wrapped:
         yield f"effects of the inputs: not judged while {', '.join(wrapped)} wraps"
@@ -377,6 +396,16 @@ def _sampling(log: Log, health: Health, told: bool) -> str:
         text += f"; stamps in {likely}? A step of {number(health.step)} s is long: "
         text += f"--units time={likely}"
     return text
+
+
+def _unit(given: str | None) -> str:
+    """Return the unit that a column has in the log, and the declared one that it had before."""
+    if given is None or re.fullmatch(r"[-\d.e]+", given):
+        return f" (times {given})" if given else ""
+    if _NO_ANGLE.fullmatch(f"_{given}"):
+        return f" [{given}]"
+    unit = "rad/s" if given.endswith("/s") or given == "rpm" else "rad"
+    return f" [{unit}]" if given == unit else f" [{unit}, from {given}]"
 
 
 def _signal(one: Signal) -> str:
@@ -455,8 +484,9 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
         about = "; about, as noise is fed back" * effect.closed_loop
         samples += f" sample{'s' * (last != 1)} of {_seconds(health.step)}"
         yield f"{pair}: suspected delay: {samples}{about}"
-    if effect.follows_state:
-        yield f"{effect.input}: closed loop, or as regular as the motion: a function of the state"
+    if effect.may_be_closed:
+        what = "a function of the state" if effect.follows_state else "its own past tells all of it"
+        yield f"{effect.input}: closed loop, or as regular as the motion: {what}"
     elif effect.closed_loop:
         yield (
             f"{effect.input}: closed loop: measurements explain {100 * effect.feedback:.0f} % of "
@@ -501,27 +531,15 @@ FIT_HELP = "fit a plant's unknown constants and a network to recorded runs: repo
 def add_fit_arguments(command: argparse.ArgumentParser) -> None:
     """Add the files and the options of the command."""
     command.add_argument("plant", metavar="PLANT", help="the arguments of dopt.Plant (.yaml)")
-    command.add_argument(
-        "logs", metavar="LOG", nargs="+", help=".csv, .csv.gz, .parquet, .mat, .h5"
-    )
+    command.add_argument("logs", metavar="LOG", nargs="+", help="files as the command log reads")
     command.add_argument("--validate", metavar="LOG", nargs="+", default=(), help="other runs")
-    command.add_argument("--columns", help="columns, such as angle=th,voltage=u (the same names)")
-    command.add_argument("--units", help="units of columns, such as t=ms,th=counts/4096")
-    command.add_argument("--time", help="column of the stamps (time, t or timestamp)")
+    _add_log_options(command)
     command.add_argument("--width", type=int, default=16, help="units of the network, 0: none (16)")
-    command.add_argument(
-        "--hold",
-        choices=("zero", "linear", "cubic"),
-        default="zero",
-        help="input between two rows (zero)",
-    )
+    holds = ("zero", "linear", "cubic")
+    command.add_argument("--hold", choices=holds, default="zero", help="input between rows (zero)")
     command.add_argument("--window", type=positive("--window", float), help="window [s] (chosen)")
-    command.add_argument("--out", type=path("--out"), default="fit", help="folder (fit/)")
-    command.add_argument(
-        "--db",
-        metavar="URL",
-        help="database that stores the fit, such as sqlite:///results.db (no database)",
-    )
+    command.add_argument("--out", type=folder("--out"), default="fit", help="folder (fit/)")
+    command.add_argument("--db", metavar="URL", help="stores the fit: sqlite:///results.db (none)")
 
 
 def run_fit(options: argparse.Namespace) -> int:
@@ -531,13 +549,11 @@ def run_fit(options: argparse.Namespace) -> int:
     if options.db:
         Store.open(options.db).close()  # before minutes of fitting
     plant = read_plant(options.plant)
-    given = {
-        "columns": names_of("--columns", options.columns),
-        "units": names_of("--units", options.units),
-        "time": options.time,
-    }
+    given, (states, inputs) = _log_options(options)
+    given["columns"] = {**states, **inputs}
     logs = [_log(file, plant, given) for file in options.logs]
     tests = [_log(file, plant, given) for file in options.validate]
+    options.out.mkdir(parents=True, exist_ok=True)
     found = dopt.fit(
         plant,
         logs,
@@ -548,7 +564,6 @@ def run_fit(options: argparse.Namespace) -> int:
         progress=lambda text: tell(sys.stderr, f"{text}\n"),
     )
     tell(sys.stdout, f"{found.report()}\n")
-    options.out.mkdir(parents=True, exist_ok=True)
     found.save(options.out / "model.npz")
     tell(sys.stdout, f"model: {options.out / 'model.npz'}\n")
     if options.db:

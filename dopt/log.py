@@ -16,16 +16,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
 from dopt.errors import SpecificationError, suggestion, unknown_name
+from dopt.outliers import MOST_OUTLIERS, NEAR, outliers
 from dopt.types import Array, Booleans, Integers
 
 if TYPE_CHECKING:
     from dopt.systems.plant import Plant
-
-CLOCKS = ("time", "t", "timestamp")
-"""Names of columns that are taken for the time, in lower case, also in a group: ``run.t``."""
 
 GAP = 10.0
 """Median steps after which a step is a gap, unless ``gap`` is given."""
@@ -35,8 +32,16 @@ TURN = 2.0 * math.pi
 UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360, "rev": TURN, "turn": TURN, "rpm": TURN / 60}
 """Units of angles, and what they are in radians; ``/s`` may follow, and ``counts/4096`` is one."""
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+SECONDS |= {"min": 60.0, "h": 3600.0}
 """Units of time [s]."""
+
+_CLOCK = re.compile(
+    r"(?!(?-i:T)_|.*_(?:min|h)$)(?:time|t|timestamp|zeit)"  # no temperature, no minimum
+    rf"(?:(?:\s*[\[(/]|\s+in|_|\s)\s*({'|'.join(SECONDS)})\s*[\])]?)?",
+    re.IGNORECASE,
+)
+UNIT_OF_ANGLE = re.compile(r"[\[(/_ ](deg(?:/s)?|mrad(?:/s)?|rpm)[\])]?$", re.IGNORECASE)
 
 _ROLL_OVERS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
 """Times after which a 32-bit counter of µs or ms begins again [s]."""
@@ -48,8 +53,10 @@ _DATE = re.compile(
 )
 
 
-def is_clock(name: str) -> bool:
-    return name.strip().lower().rsplit(".", 1)[-1] in CLOCKS
+def clock_unit(name: str) -> str | None:
+    """Return the unit in the name of a clock, "" in ``run.t``; None of what is called otherwise."""
+    found = _CLOCK.fullmatch(name.strip().rsplit(".", 1)[-1])
+    return found and (found[1] or "").lower()
 
 
 def columns_of(data: Any, names: Sequence[str] | None = None) -> dict[str, npt.NDArray[Any]]:
@@ -98,7 +105,8 @@ def clock_column(
     table: Mapping[str, Any], taken: Collection[str], time: Any, dt: float | None, notes: list[str]
 ) -> str | None:
     """Return the name of the column of the stamps, None where they are given or made of dt."""
-    found = [name for name in table if is_clock(name) and name not in taken]
+    clocks = [name for name in table if clock_unit(name) is not None and name not in taken]
+    found = [name for name in clocks if not clock_unit(name)] or clocks
     if time is not None and dt is not None:
         raise SpecificationError(
             f"a log has the time {time if isinstance(time, str) else 'of an array'!r} and dt = "
@@ -121,8 +129,8 @@ def clock_column(
         raise SpecificationError(
             f"a log has the columns {', '.join(table)}, of which {' and '.join(found) or 'none'} "
             f"{'are' if found else 'is'} called time, t or timestamp, but one column of stamps is "
-            f"expected: give its name, or stamps such as table.index, as time, or the time "
-            f"between two rows as dt, in seconds."
+            f"expected: give its name (--time), or stamps such as table.index, as time, or the "
+            f"time between two rows as dt (--dt), in seconds."
         )
     return found[0]
 
@@ -190,6 +198,8 @@ def values_of(
     """Return a column of states or inputs in the unit of the plant."""
     found = _numbers(name, values)
     if name not in units:
+        if unit := UNIT_OF_ANGLE.search(name):
+            notes.append(f"Column {name!r} is kept in {unit[1]}: units= or --units converts it.")
         return found
     factor = _factor(name, units[name], UNITS)
     notes.append(f"Column {name!r} is multiplied by {factor:.6g} ({units[name]}).")
@@ -369,7 +379,8 @@ class Log:
         these differ.
     time : str or array, optional
         Column of the stamps, or the stamps: numbers, dates or spans of time. Without it, a column
-        called time, t or timestamp is taken. Times count from the first stamp.
+        called time, t, timestamp or Zeit is taken, with a unit or without: ``time_ms``, ``t [s]``.
+        Times count from the first stamp.
     dt : float, optional
         Time between two rows [s] of a table without stamps.
     angles : sequence of str
@@ -378,8 +389,8 @@ class Log:
         Longest step within a piece [s]; 10 times the median step, unless it is given.
     units : mapping of str to str or float, optional
         Units of columns that are not as the plant has them, by state, input, column or "time":
-        "deg", "rev", "rpm", "mrad", "counts/4096" (counts a turn), each also by "/s"; "ms", "us" or
-        "ns" of stamps; or a factor.
+        "deg", "rev", "rpm", "mrad", "counts/4096" (counts a turn), each also by "/s"; "ms", "us",
+        "ns", "min" or "h" of stamps; or a factor.
     columns : sequence of str, optional
         Names of the columns of an array.
 
@@ -423,7 +434,8 @@ class Log:
         taken = {column for group in named for column in group.values()}
         clock = clock_column(table, taken, time, dt, notes)
         unit_of = _units_of(units or {}, named, clock)
-        stamps = stamps_of(table, clock, time, dt, unit_of.get(clock or "time", 1.0), notes)
+        unit = unit_of.get(clock or "time", clock_unit(clock or "") or 1.0)
+        stamps = stamps_of(table, clock, time, dt, unit, notes)
         measured, applied = (
             np.column_stack([values_of(one, table[one], unit_of, notes) for one in found.values()])
             for found in named
@@ -485,9 +497,11 @@ class Log:
             )
         notes = []
         taken = {*found.values(), *(renamed.get(name, name) for name in plant.inputs)}
-        if time is None and dt is None and not any(map(is_clock, {*table} - taken)):
+        if time is None and dt is None and {*map(clock_unit, {*table} - taken)} <= {None}:
             dt = float(plant.dt)
-            notes.append(f"No column of stamps: rows are the plant's dt of {dt:g} s apart.")
+            notes.append(
+                f"No column of stamps (--time): rows are the plant's dt of {dt:g} s apart."
+            )
         log = cls(
             table,
             states=found,
@@ -642,36 +656,6 @@ def _unwrapped(name: str, angle: Array, pieces: Rows, notes: list[str]) -> Array
             f"{count_text(passes, 'time')}: unwrapped."
         )
     return found
-
-
-NEAR, MOST_OUTLIERS = 31, 0.02
-"""Values that say what is usual, and the share of all from which there are no outliers."""
-
-
-def outliers(y: Array, period: float) -> Booleans:
-    """Return which of finite values, (N,), are far from most of the five around them.
-
-    Far is beyond the way from those before to those after, and beyond 10 times the median second
-    difference near, 1.5 times the median first one, which an end stop turns, and 1.5 times the
-    median change of the whole. Differences are taken within half a period.
-    """
-
-    def turned(change: Array) -> Array:
-        return change - (period * np.round(change / period) if period < math.inf else 0.0)
-
-    def around(part: Array, width: int) -> Array:
-        return sliding_window_view(np.pad(part, width // 2, mode="edge"), width)
-
-    first = turned(np.diff(y, prepend=y[0]))
-    usual: Array = np.full(
-        len(y), np.median(1.5 * np.abs(first[first != 0.0])) if first.any() else 0
-    )
-    for change, factor in ((turned(np.diff(first, append=first[-1])), 10.0), (first, 1.5)):
-        usual = usual + factor * np.median(around(np.abs(change), NEAR), axis=1)
-    near = around(y, 5)
-    across = np.abs(turned(near[:, 3:, None] - near[:, None, :2])).min(axis=(1, 2))
-    apart = np.median(np.abs(turned(near - y[:, None])), axis=1)
-    return np.asarray(apart > np.maximum(usual, across))
 
 
 def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str]) -> Integers:

@@ -220,6 +220,17 @@ def path(option: str) -> Callable[[str], Path]:
     return partial(given_path, what=option, refusal=UsageError)
 
 
+def folder(option: str) -> Callable[[str], Path]:
+    """Return the argument type for the path of a folder, which is not named like a file."""
+
+    def read(given: str) -> Path:
+        if given.endswith((".csv", ".html", ".npz", ".pdf", ".png", ".svg")):
+            raise UsageError(f"{option} is {given!r}, but a folder is expected: give one.")
+        return path(option)(given)
+
+    return read
+
+
 LONGEST = 100 * 365 * 86_400
 """Longest time [s] that an option takes: a hundred years."""
 

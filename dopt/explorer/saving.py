@@ -207,7 +207,7 @@ class Explored:
 
     @property
     def constants(self) -> dict[str, float]:
-        """Constants of a plant, ``delay`` and ``lag`` [s]: first guesses, or what a refit found."""
+        """Constants of a plant, ``delay``, ``lag`` [s]: guesses, or a refit's, without errors."""
         system = self._state.system
         if not isinstance(system, ExploredPlant):
             return {}

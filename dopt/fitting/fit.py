@@ -35,6 +35,7 @@ from dopt.errors import SpecificationError
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import (
+    FEWEST,
     HORIZONS,
     Predicted,
     Simulator,
@@ -244,6 +245,12 @@ class _Selection:
                 f"{longest:g} s, but at least {2 * least:g} s, {2 * FEWEST_ROWS} samples, are "
                 f"expected: give longer runs."
             )
+        if (fitting or [least])[-1] < LENGTHS[1] * self.scale:
+            self.notes.append(
+                f"the log is short: windows of {(fitting or [least])[-1]:.2g} s are the longest "
+                f"that it lets be tried, a period of the motion is about {self.scale:.2g} s: "
+                f"record {4.0 * BLOCKS * LENGTHS[-2] * self.scale:.2g} s or more"
+            )
         return fitting or [least]
 
     def _longest_block(self) -> float:
@@ -440,8 +447,11 @@ class _Selection:
 
     def held_out(self) -> dict[str, list[Predicted]]:
         """Return predictions of each block up to the longest horizon, by what made them."""
-        longest = min(max(HORIZONS) * self.window, 0.5 * self._longest_block())
-        tested = [self._tested(self.window, block, longest) for block in range(len(self.blocks))]
+        for share in reversed(HORIZONS):
+            ahead = min(share * self.window, 0.5 * self._longest_block())
+            tested = [self._tested(self.window, block, ahead) for block in range(len(self.blocks))]
+            if sum(map(len, tested)) >= FEWEST:
+                break
         out: dict[str, list[Predicted]] = {}
         for what, (model, folds) in self._folds.items():
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from scipy.special import ndtri
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model, data_of, measured_names
 from dopt.fitting.problem import (
+    FEWEST,
     HORIZONS,
     Predicted,
     Simulator,
@@ -31,7 +33,7 @@ from dopt.fitting.problem import (
     prediction_rows,
 )
 from dopt.fitting.simulation import Data
-from dopt.log import Log
+from dopt.log import Log, count_text
 from dopt.systems.plant import Plant, Unknown
 from dopt.types import Array, Integers
 
@@ -96,8 +98,8 @@ class Fitted:
     Attributes
     ----------
     constants : dict of str to (float, float)
-        Estimate and standard error of each unknown constant, of ``delay`` and ``lag`` [s]; from the
-        fit without a network.
+        Estimate and standard error of each unknown constant, in the unit of the plant, of ``delay``
+        and ``lag`` [s]; from the fit without a network. ``Explorer.constants`` has no errors.
     has_network : bool
         Whether validation wanted one.
     chosen, physics : Estimate
@@ -274,10 +276,11 @@ class Fitted:
         history, skip, ahead = 0.5 * self.selection.window, self._latest(), 2.0 * self.plant.dt
         longest = float((data.time[data.lasts] - data.time[data.firsts]).max())
         left = longest - history - skip - ahead - 2.0 * self.plant.dt
-        horizon = max(0.0, min(max(self.horizons), left))
-        rows = prediction_rows(
-            data, (0, len(data.time) - 1), history, horizon, skip=skip, ahead=ahead
-        )
+        for horizon in reversed(self.horizons):
+            lengths = history, max(0.0, min(horizon, left))
+            rows = prediction_rows(data, (0, len(data.time) - 1), *lengths, skip=skip, ahead=ahead)
+            if len(rows) >= FEWEST:
+                break
         models = {"model": self.chosen, "physics alone": self.physics}
         found = {
             what: [predicted(Simulator(each.model, data), each.solution.p, rows)]
@@ -343,35 +346,37 @@ class Fitted:
 
     def verdict(self) -> str:
         """Return in a sentence how far ahead the model is worth using."""
-        useful, longest = self._useful()
-        if not longest:
+        judged, useful = self._judged(), self.useful()
+        if not judged:
             return "Not judged: no run is long enough, or moves beyond its noise, to be predicted."
+        enough = {horizon: count for horizon, (count, _) in judged.items() if count >= FEWEST}
+        if not enough:
+            most = count_text(max(count for count, _ in judged.values()), "prediction")
+            return f"Not judged: {most} at most, but {FEWEST} are expected: give longer runs."
         if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
-        if useful < longest:
+        if useful < max(enough):
             return f"Do not use this model beyond {useful:.2g} s."
-        return f"Useful up to {useful:.2g} s, the longest time that was tried."
+        how = f"the longest time judged, by {enough[useful]} predictions"
+        return f"Useful up to {useful:.2g} s, {how}."
 
     def useful(self) -> float:
-        """Return how far ahead the model is worth using [s]; 0 for not at all."""
-        return self._useful()[0]
+        """Return how far ahead the model is worth using [s]; 0 for not at all, or not judged."""
+        judged = self._judged().items()
+        enough = [(horizon, is_good) for horizon, (count, is_good) in judged if count >= FEWEST]
+        return max((each[0] for each in itertools.takewhile(lambda one: one[1], enough)), default=0)
 
-    def _useful(self) -> tuple[float, float]:
-        """Return the longest time ahead that is worth using, and that was tried [s]."""
+    def _judged(self) -> dict[float, tuple[int, bool]]:
+        """Return, by the time ahead [s], the number of predictions and whether all are good."""
         noise = np.minimum(fast_noise(self.data), self._deviations)
         least = dict(zip(self.noise, MOVING * noise, strict=True))
-        rows = [
-            row
-            for row in self.errors()
-            if row["model"] == "model" and row["nothing_changes"] > least[row["state"]]
-        ]
-        horizons, useful = sorted({row["horizon"] for row in rows}), 0.0
-        for horizon in horizons:
-            here = [row for row in rows if row["horizon"] == horizon]
-            if not all(row["rms"] < USEFUL * row["nothing_changes"] for row in here):
-                break
-            useful = horizon
-        return useful, max(horizons, default=0.0)
+        found: dict[float, tuple[int, bool]] = {}
+        for row in self.errors():
+            if row["model"] == "model" and row["nothing_changes"] > least[row["state"]]:
+                count, is_good = found.get(row["horizon"], (row["windows"], True))
+                is_good &= row["rms"] < USEFUL * row["nothing_changes"]
+                found[row["horizon"]] = min(count, row["windows"]), is_good
+        return found
 
     def report(self) -> str:
         """Return what was found, line by line, with units."""
@@ -387,8 +392,9 @@ class Fitted:
         lines.append(f"  chosen: {network}, windows of {selection.window:.3g} s")
         lines += [f"  note: {note}" for note in selection.notes]
         where = "runs for validation" if self.tests else "held-out blocks"
-        lines += ["", f"Error of predictions on {where} (root mean square; median)"]
-        rows = self.errors()
+        alone = "" if self.has_network else "; the model is physics alone"
+        lines += ["", f"Error of predictions on {where} (root mean square; median){alone}"]
+        rows = [one for one in self.errors() if not alone or one["model"] != "physics alone"]
         for name in self.noise:
             lines.append(f"  {name} [{plant.states[name]}]")
             for horizon in sorted({row["horizon"] for row in rows}):
@@ -396,8 +402,9 @@ class Fitted:
                 models = ", ".join(f"{row['model']} {row['rms']:.3g}" for row in here)
                 best = next(row for row in here if row["model"] == "model")
                 lines.append(
-                    f"    {horizon:.3g} s: {models}, nothing changes {best['nothing_changes']:.3g};"
-                    f" median of the model {best['median']:.3g}"
+                    f"    {horizon:.3g} s, {count_text(best['windows'], 'prediction')}: {models}, "
+                    f"nothing changes {best['nothing_changes']:.3g}; median of the model "
+                    f"{best['median']:.3g}"
                 )
         lines.append("")
         for name, share in self.coverage().items():

@@ -444,6 +444,9 @@ def first_states(data: Data, model: Model, rows: Integers) -> Array:
 HORIZONS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Times ahead of which errors are reported, by the length of the windows."""
 
+FEWEST = 5
+"""Fewest predictions that judge a model: of fewer, they go less far ahead."""
+
 ORDER = 4
 """Earlier outputs and inputs that the linear model reads."""
 

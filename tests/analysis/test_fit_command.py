@@ -40,7 +40,7 @@ def test_the_plant_of_the_page_is_fitted(
     plant: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, url = tmp_path / "out", f"sqlite:///{tmp_path}/results.db"
-    columns = ("--columns", "angle=th,voltage=u")
+    columns = ("--states", "angle=th", "--inputs", "voltage=u", "--time", "t")
     words = ["fit", str(plant), str(run), "--validate", str(run), *columns, "--width", "3"]
     words += ["--db", url]
     assert cli.main([*words, "--out", str(out)]) == 0
@@ -99,6 +99,15 @@ def test_a_database_that_cannot_be_used_is_said_before_the_fit(
     said = capsys.readouterr()
     assert "write it as sqlite:///results.db" in said.err
     assert not said.out
+
+
+@pytest.mark.parametrize(
+    "command", [["figures"], ["report"], ["fit", "motor.yaml", "run.csv"]], ids=" ".join
+)
+def test_a_picture_is_no_folder(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder that was called fit.png was made."""
+    assert cli.main([*command, "--out", "fit.png"]) == 2
+    assert "--out is 'fit.png', but a folder is expected" in capsys.readouterr().err
 
 
 def test_a_field_that_is_none_is_named(

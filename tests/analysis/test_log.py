@@ -165,6 +165,20 @@ def test_feedback_is_found_of_an_input_that_stays_at_its_limits(seed: int, gain:
     assert one_effect(np.array(seen), np.array(u)).closed_loop == bool(gain)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_smooth_input_of_a_controller_is_not_called_open_loop(seed: int) -> None:
+    """Its past tells all of it but the last digit: a cylinder with a fine scale."""
+    rng = np.random.default_rng(seed)
+    place, speed, seen, u = 0.1, 0.0, [], []
+    for wanted in np.repeat(rng.uniform(0.05, 0.25, 20), 200):
+        seen.append(round((place + 1e-4 * rng.normal()) / 1e-4) * 1e-4)
+        u.append(round(float(np.clip(40 * (wanted - seen[-1]), -8, 8)), 2))
+        for _ in range(10):
+            place, speed = place + 1e-3 * speed, speed + 1e-3 * 60 * (0.06 * u[-1] - speed)
+    effect = one_effect(np.array(seen), np.array(u), "x")
+    assert effect.closed_loop or effect.may_be_closed
+
+
 @pytest.mark.parametrize("slower", [2, 3, 10])
 def test_a_slow_sensor_beside_a_fast_one_is_no_defect(slower: int) -> None:
     """Where no two rows that follow each other have all states, no effect is judged."""
@@ -389,6 +403,18 @@ def test_a_file_that_is_no_log_is_answered_by_a_sentence(
     assert "expected" in str(raised.value) or "convert it" in str(raised.value)
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig"])
+def test_a_spreadsheet_of_windows_is_read(encoding: str, tmp_path: Path) -> None:
+    renamed = frame().rename(columns={"t": "Zeit [s]", "th": "Fühler_deg"})
+    renamed.to_csv(tmp_path / "run.csv", index=False, sep=";", decimal=",", encoding=encoding)
+    log = analysis.read_log(tmp_path / "run.csv")
+    assert (log.states, log.notes) == (
+        ("Fühler_deg",),
+        ("Column 'Fühler_deg' is kept in deg: units= or --units converts it.",),
+    )
+    np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
+
+
 def test_what_a_file_holds_is_said_if_it_is_no_table_or_more(tmp_path: Path) -> None:
     savemat(tmp_path / "mixed.mat", {"a": np.zeros(5), "b": np.zeros(7), "c": np.zeros(9)})
     with pytest.raises(AnalysisError, match=r"holds a \(5,\), b \(7,\), c \(9,\)"):
@@ -423,6 +449,7 @@ def test_the_command_prints_and_draws(
     assert "steps of 0.00314159 (2,000 a turn)" in said
     assert "suspected delay: 0 samples" in said
     assert "in radians" not in said  # its unit was declared
+    assert "th [rad, from counts/2000]: " in said
     assert "pieces end there: row 1000" in said
     assert Path("figures/run.png").stat().st_size > 10_000
     assert cli.main(["log", "run.csv", *words, "--inputs", "u=", "--out", "a.pdf"]) == 2
@@ -430,6 +457,19 @@ def test_the_command_prints_and_draws(
     assert cli.main(["log", "none.csv"]) == 2
     assert cli.main(["log", "run.csv", "--out", "a.xyz"]) == 2
     assert "endings .png, .pdf, .svg" in capsys.readouterr().err
+    named = table.rename(columns={"ms": "Zeit [ms]", "enc": "level [mm]", "u": "u_rpm"})
+    named.to_csv("named.csv", index=False)
+    assert cli.main(["log", "named.csv", "--columns", "level=level [mm],u=u_rpm"]) == 0
+    said = capsys.readouterr().out
+    assert "level [mm]: " in said
+    assert "u: " in said
+    assert "'u_rpm' is kept in rpm: units= or --units converts it" in said
+    assert "degrees" not in said
+    both = ["--columns", "angle=enc,motor_torque=u", "--time", "ms", "--units", "ms=ms"]
+    assert cli.main(["log", "run.csv", *both]) == 0
+    assert "states angle, inputs motor_torque" in capsys.readouterr().out
+    assert cli.main(["log", "run.csv", *both, "--inputs", "motor_torque=u"]) == 0
+    assert "states angle, inputs motor_torque" in capsys.readouterr().out
 
 
 # Recorded runs of real plants (their sources and licences: README.md in the folder of DOPT_DATA)

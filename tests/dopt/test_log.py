@@ -353,3 +353,35 @@ def test_a_log_needs_numpy_alone_and_no_unix() -> None:
     )
     loaded = {name.partition(".")[0] for name in loaded_by(program)}
     assert not loaded & {"pandas", "scipy", "numba", "torch", "sqlalchemy", "matplotlib"}
+
+
+# Names of clocks
+
+
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [
+        ("Zeit [ms]", 1e-3),
+        ("Time [ms]", 1e-3),
+        ("t (ms)", 1e-3),
+        ("time_ms", 1e-3),
+        ("timestamp_us", 1e-6),
+        ("Zeit [s]", 1.0),
+        ("run.t_s", 1.0),
+        ("t/ms", 1e-3),
+        ("time in µs", 1e-6),
+        ("Time [min]", 60.0),
+    ],
+)
+def test_a_clock_may_have_its_unit_in_its_name(name: str, step: float) -> None:
+    found = log({name: T / step, "th": T, "u": T})
+    np.testing.assert_allclose(found.pieces[0].time, T, atol=1e-12)
+    given = log({name: T * 1e9, "th": T, "u": T}, units={name: "ns"})
+    np.testing.assert_allclose(given.pieces[0].time, T, atol=1e-12)
+    assert not log({name: T, "t": T, "th": T, "u": T}).notes, "one without a unit goes before"
+
+
+@pytest.mark.parametrize("name", ["T_s", "t_min", "t [N]", "time_out", "timer", "t_max"])
+def test_what_is_no_clock_is_not_taken_for_one(name: str) -> None:
+    with pytest.raises(SpecificationError, match=r"of which none is called time.*--time.*--dt"):
+        log({name: T, "th": T, "u": T})

@@ -334,6 +334,7 @@ def test_a_network_is_refused_where_the_constants_tell_all() -> None:
     assert float(changed) == pytest.approx(network - constants, abs=1e-3)
     assert "lack something" not in report
     assert "-0.00" not in report
+    assert report.count("physics alone") == 1, "it is the model"
     assert [row["model"] for row in found.errors()[:1]] == ["model"], "what is used comes first"
 
 
@@ -345,7 +346,9 @@ def test_a_network_is_kept_where_something_is_not_declared(fitted: Fitted) -> No
     assert by_model["model"] < 0.7 * by_model["physics alone"] < by_model["linear"]
     assert fitted.verdict().startswith("Useful up to")
     [row, *_] = [row for row in fitted.errors() if row["model"] == "model"]
-    assert f"median of the model {row['median']:.3g}\n" in fitted.report()
+    report = fitted.report()
+    assert f"median of the model {row['median']:.3g}\n" in report
+    assert f"s, {row['windows']} predictions: model {row['rms']:.3g}, physics alone" in report
 
 
 def test_bounds_hold_what_they_say_on_another_run(fitted: Fitted) -> None:
@@ -580,9 +583,22 @@ def test_short_runs_are_judged_as_far_as_they_go() -> None:
     found = dopt.fit(declared(), [run(0), other[:30], other[30:60]], width=0)
     assert np.isnan(found.coverage()["angle"])
     assert "Bounds of 90 % are not judged on held-out angle" in found.report()
-    for rows, words in ((60, "Useful up to 0.6 s"), (15, "Not judged: no run is long")):
+    for rows, words in (
+        (300, "Useful up to 0.6 s, the longest time judged, by 6 predictions"),
+        (60, "Not judged: 2 predictions at most, but 5 are expected"),
+        (15, "Not judged: no run is long"),
+    ):
         short = dopt.fit(declared(), run(0), width=0, window=0.6, validate=other[:rows])
         assert short.verdict().startswith(words)
+
+
+def test_a_log_that_is_short_beside_its_motion_is_said(fitted: Fitted) -> None:
+    """Windows of a few samples were taken without a word."""
+    short = dopt.fit(declared(), run(0, 156), width=0)
+    [note] = [one for one in short.selection.notes if one.startswith("the log is short")]
+    assert f"windows of {short.selection.window:.2g} s are the longest" in note
+    assert "record" in note
+    assert "the log is short" not in fitted.report()
 
 
 def test_stamps_in_another_unit_are_refused() -> None:
