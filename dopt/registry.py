@@ -18,10 +18,11 @@ import linecache
 import re
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 from dopt.errors import SpecificationError, unknown_name
@@ -160,10 +161,29 @@ def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any)
         missing += [key for key in sorted(declared - {"name"}) if not hasattr(own, key)]
     if missing:
         raise _unfit(section, path, f"a class that defines {', '.join(missing)}")
+    for base in (base for base in own.__mro__ if base.__module__.startswith("dopt.")):
+        if unlike := _unlike(base, lambda key: inspect.getattr_static(own, key).__get__(0, own)):
+            raise _unfit(section, path, f"a class with {', '.join(unlike)}")
     name = own.__dict__.get("name")
     if not isinstance(name, str) or name in registry:
         raise _unfit(section, path, "a class with a 'name' of its own, which no other has")
     return own
+
+
+def _unlike(base: type, method_of: Callable[[str], Any]) -> list[str]:
+    """Return the methods of a base whose arguments the method found does not take."""
+    unlike = []
+    for key, value in vars(base).items():
+        if isinstance(value, FunctionType | staticmethod) and key[0] != "_":
+            given = inspect.signature(value.__get__(0, base)).parameters.values()
+            names = [one.name for one in given if one.default is one.empty]
+            try:
+                inspect.signature(method_of(key)).bind(*names)
+            except TypeError:
+                unlike.append(f"{key}({', '.join(names)})")
+            except ValueError:  # of a method in C, whose arguments nobody knows
+                continue
+    return unlike
 
 
 def check_source(
@@ -378,6 +398,7 @@ def check_returned(whose: str, method: str, found: object, base: type) -> None:
     """
     wanted = [key for key, value in vars(base).items() if callable(value) and key[0] != "_"]
     missing = [key for key in wanted if not callable(getattr(found, key, None))]
+    missing = missing or _unlike(base, partial(getattr, found))
     if not missing and not isinstance(found, type):
         return
     shown, remedy = "None", f"add the return statement to {method}()"

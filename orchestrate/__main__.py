@@ -5,6 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from orchestrate.interrupts import end_at_interrupt
+
+if __name__ == "__main__":
+    end_at_interrupt()
+
 from orchestrate.program import answered, check_removed, run
 
 if __name__ == "__main__":

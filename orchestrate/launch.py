@@ -13,6 +13,11 @@ if __package__ in (None, ""):
     # Python puts a script's own folder first; the packages are in the folder above it.
     sys.path[: not sys.flags.safe_path] = [str(Path(__file__).resolve().parents[1])]
 
+from orchestrate.interrupts import end_at_interrupt, raise_at_interrupt
+
+if __name__ == "__main__":
+    end_at_interrupt()
+
 from dopt.process import collect_rarely
 from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.limits import pin_threads
@@ -36,6 +41,7 @@ def main() -> int:
         )
     if not os.environ.get(URL_VARIABLE):
         os.environ.pop(URL_VARIABLE, None)  # oc.env of the configuration takes "" as a URL
+    end_at_interrupt()
     try:
         request = read_command_line()
         if request is None:
@@ -47,6 +53,8 @@ def main() -> int:
         if getattr(error, "errno", None) or isinstance(error, MemoryError):
             raise  # the system refuses something
         raise LaunchError(format_error(error)) from error
+    finally:
+        raise_at_interrupt()
     return start.run(request, grid, settings)
 
 

@@ -29,6 +29,7 @@ from typing import IO, Any, NoReturn, ParamSpec, TextIO
 import dopt
 from dopt.errors import DISTRIBUTION, DoptError, given_path, unknown_name
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError, without_password
+from orchestrate.interrupts import end_at_interrupt, raise_at_interrupt
 
 _INSTALLED = {
     "dopt": "python -m orchestrate",
@@ -290,6 +291,7 @@ def analysis() -> None:
 
 def run(module: str) -> NoReturn:
     """Run the function ``main`` of a module as a program of its own, and exit with its code."""
+    end_at_interrupt()
     _open_streams()
     readable_streams()
     _tolerate_warnings()
@@ -418,7 +420,9 @@ def _main(module: str) -> int:
         if "--version" in sys.argv[1:]:
             say(version())
             return ExitCode.DONE
-        return int(importlib.import_module(module).main())
+        main = importlib.import_module(module).main
+        raise_at_interrupt()
+        return int(main())
     finally:
         sys.stdout.flush()
 

@@ -260,8 +260,8 @@ def _assesses_samples(section: object) -> bool:
     if section == {"sample_loss": True}:
         return True
     raise SpecificationError(
-        f"configuration key 'assess' is {section!r}, but a section with sample_loss, true or "
-        f"false, is expected: write for instance assess.sample_loss=true."
+        f"configuration key 'assess' is {str(section).replace(': None', ': null')}, but a section "
+        "with sample_loss, true or false, is expected: write for instance assess.sample_loss=true."
     )
 
 

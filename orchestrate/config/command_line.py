@@ -197,6 +197,8 @@ def _check_choice(word: str) -> None:
     group, value = match["group"], match["value"]
     if match["added"] and not match["package"] and not value.startswith("{"):
         raise UsageError(f"'{word}' adds an option, but {group} has one already: leave out the +.")
+    if group == "experiment" and value.strip() == "null":
+        raise UsageError(f"'{word}' is what a launch without it has: leave it out.")
     if group != "experiment" and _NO_OPTION.fullmatch(value):
         what = f"the list {value}" if value.startswith("[") else value or "empty"
         raise SpecificationError(

@@ -32,7 +32,8 @@ from orchestrate.executors.base import Executor, Run, executor_factory, make_exe
 from orchestrate.program import ROOT, answered, exit_code, say, tell
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
 from orchestrate.runner.saving import Patience, RetryingStore, kept_alive, launch_record
-from orchestrate.runner.scheduler import Chunks, Scheduler, SeedPlan, check_memory
+from orchestrate.runner.scheduler import Chunks, Scheduler, check_memory
+from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.store import (
     FINISHED,
     RETRIED,

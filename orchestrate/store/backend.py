@@ -306,7 +306,7 @@ def out_of_time(seconds: float | None) -> QueryError:
     """Return the error of a query that was ended after ``seconds``."""
     return QueryError(
         f"The query took longer than {seconds or 0:g} s and was cancelled: make it smaller, or "
-        "increase its time limit."
+        "run it by python -m orchestrate query with a larger --timeout."
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from orchestrate.runner.scheduler import half_width, is_narrow, looks
+from orchestrate.runner.seed_plan import half_width, is_narrow, looks
 
 Array = npt.NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, ...]], Array]

@@ -26,6 +26,7 @@ from dopt.registry import check_importable, source_digest
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec, stored_trial, system_of
 from dopt.systems import SYSTEMS, System
+from dopt.systems.pendulum import Pendulum
 from tests.paths import EXAMPLE
 
 
@@ -82,6 +83,23 @@ def typed(*cells: str, known: bool = True) -> Any:
 @dataclass(frozen=True, kw_only=True)
 class Closed(Policy):
     name = "closed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Short(CustomPolicy):
+    name = "short"
+
+    def planner(self, system: System) -> Planner:  # type: ignore[override]  # the fault
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Long(Pendulum):
+    name = "long"
+
+    @staticmethod
+    def known(state: Any, inputs: Any, parameters: Any, more: Any) -> Any:  # type: ignore[override]
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +180,8 @@ HERE = __name__
         ("env", "vehicle.Boat", {"mas": 3.0}, r"env\.boat field"),
         ("policy", f"{HERE}.Nameless", {}, "a class with a 'name' of its own"),
         ("policy", f"{HERE}.Thief", {}, "a class with a 'name' of its own"),
+        ("policy", f"{HERE}.Short", {}, r"but a class with planner\(system, rng\) is expected"),
+        ("env", f"{HERE}.Long", {}, r"but a class with known\(state, inputs, parameters\) is exp"),
         ("policy", f"{HERE}.Closed", {}, "derive it from OpenLoop or CustomPolicy"),
         ("policy", "tests.dopt.custom_plugins.InTorch", {}, r"numpy, .* from CompiledPolicy\.$"),
         ("policy", "__main__.Nowhere", {}, r"policy is of the class .*into a file"),

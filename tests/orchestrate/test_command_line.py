@@ -117,6 +117,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["--resolve"], "--resolve goes with --cfg or --help"),
         (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor, beyond/car"),
         (["env="], "env is empty, but one of arm"),
+        (["experiment=null"], "'experiment=null' is what a launch without it has: leave it out"),
         (["policy=5"], "the option of a group is a number, but one of its names is expected"),
         (["--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "add it with \\+env\\.mass="),
         (["--config-dir", str(OPTIONS), "env=boat", "env.gama=3"], "did you mean 'gamma'"),

@@ -208,6 +208,27 @@ def run_program(words: list[str], cwd: Path, **environment: str) -> tuple[int, s
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.parametrize("loaded", ["dopt", "dopt.errors", "numpy", "sqlalchemy"])
+@pytest.mark.parametrize("words", PROGRAMS, ids=lambda words: words[-1])
+def test_an_interrupt_while_libraries_load_ends_a_program_with_130_and_no_traceback(
+    words: list[str], loaded: str, tmp_path: Path
+) -> None:
+    first = [str(ROOT / words[0])] if len(words) == 1 else words
+    command = [sys.executable, "-X", "importtime", *first, WORDS[words[-1]]]
+    environment = {**without_coverage(), "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, text=True, stderr=subprocess.PIPE
+    ) as running:
+        assert running.stderr is not None
+        lines = []
+        for line in running.stderr:
+            lines.append(line)
+            if line.endswith(f" {loaded}\n"):
+                running.send_signal(signal.SIGINT)
+    assert running.returncode == 130, "".join(lines[-30:])
+    assert all(line.startswith("import time:") for line in lines)
+
+
 @pytest.mark.parametrize("words", PROGRAMS, ids=lambda words: words[-1])
 def test_a_deleted_folder_is_named(words: list[str], tmp_path: Path) -> None:
     gone = tmp_path / "gone"

@@ -231,6 +231,7 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.detach=null", "launch.detach is null, but"),
         ("seed=null", "seed is null, but"),
         ("assess.sample_loss=yes please", "'assess' is {'sample_loss': 'yes please'}, but"),
+        ("assess.sample_loss=null", "'assess' is {'sample_loss': null}, but"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
         ("launch.patience=60", "launch.patience is 60, but less than launch.lease=60 is expected"),
     ],

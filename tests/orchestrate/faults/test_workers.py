@@ -15,7 +15,7 @@ from orchestrate.runner import worker as worker_module
 from orchestrate.runner.progress import Interrupt
 from orchestrate.runner.scheduler import MAX_WORKER_LOSSES, POLL_SECONDS, SUSPECT_LOSSES
 from orchestrate.runner.worker import WARNINGS, Leave
-from tests.orchestrate.faults.laboratory import OPEN, Laboratory, Server, preempt
+from tests.orchestrate.faults.laboratory import ENDED, Laboratory, Server, preempt
 from tests.orchestrate.faults.trials import BROKEN_SEED
 
 At = Callable[..., Laboratory]
@@ -135,7 +135,7 @@ def test_a_trial_that_kills_its_worker_runs_alone_and_stops_in_the_end(
     )
     register(laboratory)
     codes = []
-    while laboratory.count(OPEN):
+    while laboratory.count(ENDED) < 20:
         with laboratory.launched(worker={}) as worker:
             codes.append(worker.end())
         assert len(codes) <= 4 * losses, worker.said + worker.errors

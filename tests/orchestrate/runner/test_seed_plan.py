@@ -17,7 +17,7 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid, LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
-from orchestrate.runner.scheduler import (
+from orchestrate.runner.seed_plan import (
     FEWEST_SEEDS,
     FEWEST_VALUES,
     MOST_LOOKS,
