@@ -25,7 +25,19 @@ def sequences(
     """Return a log with the specification of its robot, for ``mujoco.sysid.optimize``.
 
     The specification has a motor, which applies the torque, and a sensor of position for each
-    driven joint, in place of its own actuators and sensors.
+    driven joint, in place of its own actuators and sensors, and an explicit mass for each body.
+    A fit of friction, armature and a mass:
+
+        parameters = sysid.ParameterDict()
+        for name, nominal, change in (
+            ("damping", 0.5, lambda spec, one: spec.joint("a").damping.put(0, one.value)),
+            ("dry", 0.3, lambda spec, one: setattr(spec.joint("a"), "frictionloss", one.value[0])),
+            ("rotor", 0.1, lambda spec, one: setattr(spec.joint("a"), "armature", one.value[0])),
+            ("mass", 1.0, lambda spec, one: setattr(spec.body("hand"), "mass", one.value[0])),
+        ):
+            parameters.add(sysid.Parameter(name, nominal, 0.01, 9.0, modifier=change))
+        residual = sysid.build_residual_fn(models_sequences=[sequences(body, log)])
+        fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual)
 
     Parameters
     ----------
@@ -108,9 +120,13 @@ def _measured(body: Body, dt: float) -> Any:
     for part in [*spec.keys, *spec.actuators, *spec.sensors]:
         spec.delete(part)
     spec.option.timestep = dt
-    # What :class:`Body` moved to the joints, from flags and actuators.
-    if body.model.jnt_actgravcomp.any():
-        for part in spec.bodies:
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    for part in spec.bodies[1:]:  # of geoms, a mass that is set would count for nothing
+        part.explicitinertial, part.fullinertia = True, np.full((6, 1), np.nan)
+        for kind in ("mass", "inertia", "ipos", "iquat"):
+            setattr(part, kind, getattr(body.model, f"body_{kind}")[part.id])
+        # What :class:`Body` moved to the joints, from flags and actuators.
+        if body.model.jnt_actgravcomp.any():
             part.gravcomp = 0.0
     for part in spec.joints:
         part.name = part.name or f"joint{part.id}"
