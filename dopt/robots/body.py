@@ -106,6 +106,12 @@ class Body:
         self.addresses = model.jnt_qposadr[self._ids]
         self.joints = tuple(_name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in self._ids)
         self._paths = _paths(model, self._ids)
+        if closed := _closed(model, self._ids, self._paths):
+            raise SpecificationError(
+                f"the constraint {listed(closed)} ties bodies or joints that actuators move apart, "
+                f"but a robot without closed loops is expected: take it from the file, or the "
+                f"actuators that move what it ties."
+            )
         self.moved = tuple(b for b in range(1, model.nbody) if self._paths[b])
         self.bodies = tuple(_name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in self.moved)
 
@@ -137,6 +143,8 @@ class Body:
             bounded = "inertia" in text and "eigenvalues" not in text
             urdf = bounded and b"<robot" in source.read_bytes()
             remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
+            if b"xmlns:xacro" in source.read_bytes():
+                remedy = f"expand it (xacro {source.name} > robot.urdf)"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
                 f"{remedy}."
@@ -543,6 +551,26 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
     return paths
 
 
+def _closed(model: mujoco.MjModel, ids: list[int], paths: list[list[int]]) -> list[str]:
+    """Return the equality constraints that some motion of the driven joints alone breaks."""
+    import mujoco
+
+    kinds, found = mujoco.mjtEq, list[str]()
+    of_bodies = int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)
+    for e in np.flatnonzero(model.eq_active0):
+        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        if model.eq_type[e] == kinds.mjEQ_JOINT:
+            tied = ends[0] in ids and ends[1] in [*ids, -1]
+        elif model.eq_type[e] in of_bodies:
+            of_sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
+            one, other = model.site_bodyid[ends] if of_sites else ends
+            tied = paths[one] != paths[other]
+        else:
+            tied = False
+        found += [_name(model, mujoco.mjtObj.mjOBJ_EQUALITY, e)] * tied
+    return found
+
+
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
     import mujoco
 
@@ -593,6 +621,7 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     except ValueError as error:
         if "Error opening file" not in str(error) and "resource" not in str(error).lower():
             raise
+        missing = error
     spec = mujoco.MjSpec.from_file(str(source))
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
@@ -600,7 +629,10 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     lost = [Path(mesh.file).name for mesh in spec.meshes]
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
-    return spec, spec.compile(), lost
+    try:
+        return spec, spec.compile(), lost
+    except ValueError:  # the mesh is the mass of a body
+        raise missing from None
 
 
 def _located(source: Path, file: str) -> str:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 NEAR = 5
 """Rows on each side of the first one of a piece by which its velocities are estimated."""
 
+DEFAULTS = ("gear", "armature", "damping")
+"""What default classes may give to an actuator, as MuJoCo names it; early versions lack some."""
+
 
 def sequences(
     body: Body, log: Any, name: str = "log", seconds: float = 1.0
@@ -130,12 +133,18 @@ def _measured(body: Body, dt: float) -> Any:
             part.gravcomp = 0.0
     for part in spec.joints:
         part.name = part.name or f"joint{part.id}"
+    empty = mujoco.MjSpec()
+    plain = empty.add_actuator()
     for joint, dof in zip(body.joints, body.dofs, strict=True):
         part, linear = spec.joint(joint), body.model.dof_damping[dof]
         part.armature = body.model.dof_armature[dof]
         part.damping = [linear, *part.damping[1:]] if np.ndim(part.damping) else linear
         motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
+        for kind in DEFAULTS:  # else the file's
+            if hasattr(plain, kind):
+                setattr(motor, kind, getattr(plain, kind))
+        motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
         spec.add_sensor(
             name=f"{joint}_position",
             type=mujoco.mjtSensor.mjSENS_JOINTPOS,

@@ -236,14 +236,16 @@ def test_numbers_of_problems_are_positive(
 def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_mass(
     tmp_path: Path,
 ) -> None:
-    """A mass that was set once counted for nothing, where the file gives geoms alone."""
+    """A mass that was set once counted for nothing, where the file gives geoms alone; its
+    defaults were those of the motors."""
     from mujoco import sysid
 
     from dopt.robots.sysid import sequences
 
     (tmp_path / "two.xml").write_text(
         """<mujoco><compiler inertiafromgeom="true"/><option timestep="0.002"/>
-      <default><geom contype="0" conaffinity="0"/></default><worldbody><body pos="0 0 1">
+      <default><geom contype="0" conaffinity="0"/><motor gear="3" armature="1"
+      ctrllimited="true" forcelimited="true"/></default><worldbody><body pos="0 0 1">
       <joint name="a" axis="0 1 0" damping="0.8" frictionloss="0.5" armature="0.2"/>
       <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
       <body name="hand" pos="0.3 0 0"><joint name="b" axis="0 1 0" damping="0.3"/>
