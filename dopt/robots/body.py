@@ -30,6 +30,9 @@ BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia=
 PACKAGE = "package://"
 """Beginning of the files of a ROS package."""
 
+UNREAD = "error opening file", "resource", "decoder", "mesh"
+"""Parts of the engine's messages about meshes that are not there, or in a format such as .dae."""
+
 DEEPER, ANYWHERE = 0.005, 200
 """Metres by which bodies that touch at home may come deeper, and random positions looked at."""
 
@@ -143,7 +146,7 @@ class Body:
             bounded = "inertia" in text and "eigenvalues" not in text
             urdf = bounded and b"<robot" in source.read_bytes()
             remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
-            if b"xmlns:xacro" in source.read_bytes():
+            if b"<xacro:" in source.read_bytes() and "inertia" not in text and "mesh" not in text:
                 remedy = f"expand it (xacro {source.name} > robot.urdf)"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
@@ -154,7 +157,7 @@ class Body:
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """Parts of the model that torques, or searches for collisions, leave out."""
-        lost = f"left out: meshes and their contacts, for one is not there: {listed(self._lost)}"
+        lost = f"left out: meshes and their contacts, for one cannot be read: {listed(self._lost)}"
         left = _left_out(self.model, self._ids)
         return (*[lost][: len(self._lost)], *left, *self._contacts.left_out())
 
@@ -610,7 +613,7 @@ def _name(model: mujoco.MjModel, kind: Any, i: int) -> str:
 
 
 def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]:
-    """Return what a file says, its model, and the meshes that both lack, if one is not there."""
+    """Return what a file says, its model, and the meshes that both lack, if one is not read."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(source))
@@ -619,7 +622,7 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     try:
         return spec, spec.compile(), []
     except ValueError as error:
-        if "Error opening file" not in str(error) and "resource" not in str(error).lower():
+        if not any(word in str(error).lower() for word in UNREAD):
             raise
         missing = error
     spec = mujoco.MjSpec.from_file(str(source))
@@ -631,8 +634,8 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
         spec.delete(part)
     try:
         return spec, spec.compile(), lost
-    except ValueError:  # the mesh is the mass of a body
-        raise missing from None
+    except ValueError as error:  # of a body whose mass the mesh gives, for one
+        raise ValueError(f"{missing}; without meshes: {error}") from None
 
 
 def _located(source: Path, file: str) -> str:

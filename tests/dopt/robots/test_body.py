@@ -370,11 +370,11 @@ NEGATIVE = FLAT.replace('izz="3"', 'izz="-1"')
         (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
         (f'<robot name="r"><link name="a"/>{NEGATIVE}</robot>', "expected: correct it"),
         ("", "robot.xml"),
-        ('<robot xmlns:xacro="x" name="r"><link/></robot>', r"expand it \(xacro robot.xml"),
+        ('<robot xmlns:xacro="x" name="r"><xacro:a/><link/></robot>', r"expand it \(xacro robot.xml"),
         (
             """<mujoco><asset><mesh name="m" file="none.stl"/></asset><worldbody><body><joint/>
             <geom type="mesh" mesh="m"/></body></worldbody></mujoco>""",
-            "none.stl",
+            "none.stl.*; without meshes: .*mass and inertia",
         ),
     ],
 )
@@ -486,14 +486,18 @@ def test_meshes_of_a_ros_package_are_found_in_its_folder(tmp_path: Path, package
     assert (body.model.nmesh, body.notes) == (1, ())
 
 
-def test_meshes_that_are_not_there_are_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mesh", ["link.stl", "link.dae", "flat.stl"])
+def test_meshes_that_are_not_there_or_not_read_are_said(tmp_path: Path, mesh: str) -> None:
+    """Collada is what many packages of ROS have: such robots were once refused."""
+    (tmp_path / "link.dae").write_text("<COLLADA/>")
+    (tmp_path / "flat.stl").write_bytes(bytes(84))
     (tmp_path / "arm.xml").write_text(
-        """<mujoco><asset><mesh name="m" file="parts/link.stl"/></asset><worldbody>
+        f"""<mujoco><asset><mesh name="m" file="{mesh}"/></asset><worldbody>
         <body><joint name="a"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
         <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
     )
     body = Body.load(tmp_path / "arm.xml")
-    said = "left out: meshes and their contacts, for one is not there: link.stl"
+    said = f"left out: meshes and their contacts, for one cannot be read: {mesh}"
     assert (body.model.ngeom, body.notes) == (0, (said,))
 
 
