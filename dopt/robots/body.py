@@ -30,6 +30,9 @@ BOUNDS = '<mujoco><compiler balanceinertia="true" boundmass="1e-4" boundinertia=
 PACKAGE = "package://"
 """Beginning of the files of a ROS package."""
 
+UNREAD = "error opening file", "resource", "decoder", "mesh"
+"""Parts of the engine's messages about meshes that are not there, or in a format such as .dae."""
+
 DEEPER, ANYWHERE = 0.005, 200
 """Metres by which bodies that touch at home may come deeper, and random positions looked at."""
 
@@ -106,6 +109,12 @@ class Body:
         self.addresses = model.jnt_qposadr[self._ids]
         self.joints = tuple(_name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in self._ids)
         self._paths = _paths(model, self._ids)
+        if closed := _closed(model, self._ids, self._paths):
+            raise SpecificationError(
+                f"the constraint {listed(closed)} ties bodies or joints that actuators move apart, "
+                f"but a robot without closed loops is expected: take it from the file, or the "
+                f"actuators that move what it ties."
+            )
         self.moved = tuple(b for b in range(1, model.nbody) if self._paths[b])
         self.bodies = tuple(_name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in self.moved)
 
@@ -137,6 +146,8 @@ class Body:
             bounded = "inertia" in text and "eigenvalues" not in text
             urdf = bounded and b"<robot" in source.read_bytes()
             remedy = f"put {BOUNDS} into its <robot>" if urdf else "correct it"
+            if b"<xacro:" in source.read_bytes() and "inertia" not in text and "mesh" not in text:
+                remedy = f"expand it (xacro {source.name} > robot.urdf)"
             raise SpecificationError(
                 f"{source} cannot be read ({text}), but a robot in MJCF or URDF is expected: "
                 f"{remedy}."
@@ -146,7 +157,7 @@ class Body:
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """Parts of the model that torques, or searches for collisions, leave out."""
-        lost = f"left out: meshes and their contacts, for one is not there: {listed(self._lost)}"
+        lost = f"left out: meshes and their contacts, for one cannot be read: {listed(self._lost)}"
         left = _left_out(self.model, self._ids)
         return (*[lost][: len(self._lost)], *left, *self._contacts.left_out())
 
@@ -543,6 +554,26 @@ def _paths(model: mujoco.MjModel, ids: list[int]) -> list[list[int]]:
     return paths
 
 
+def _closed(model: mujoco.MjModel, ids: list[int], paths: list[list[int]]) -> list[str]:
+    """Return the equality constraints that some motion of the driven joints alone breaks."""
+    import mujoco
+
+    kinds, found = mujoco.mjtEq, list[str]()
+    of_bodies = int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)
+    for e in np.flatnonzero(model.eq_active0):
+        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        if model.eq_type[e] == kinds.mjEQ_JOINT:
+            tied = ends[0] in ids and ends[1] in [*ids, -1]
+        elif model.eq_type[e] in of_bodies:
+            of_sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
+            one, other = model.site_bodyid[ends] if of_sites else ends
+            tied = paths[one] != paths[other]
+        else:
+            tied = False
+        found += [_name(model, mujoco.mjtObj.mjOBJ_EQUALITY, e)] * tied
+    return found
+
+
 def _left_out(model: mujoco.MjModel, ids: list[int]) -> list[str]:
     import mujoco
 
@@ -582,7 +613,7 @@ def _name(model: mujoco.MjModel, kind: Any, i: int) -> str:
 
 
 def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str]]:
-    """Return what a file says, its model, and the meshes that both lack, if one is not there."""
+    """Return what a file says, its model, and the meshes that both lack, if one is not read."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(source))
@@ -591,8 +622,9 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     try:
         return spec, spec.compile(), []
     except ValueError as error:
-        if "Error opening file" not in str(error) and "resource" not in str(error).lower():
+        if not any(word in str(error).lower() for word in UNREAD):
             raise
+        missing = error
     spec = mujoco.MjSpec.from_file(str(source))
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
@@ -600,7 +632,10 @@ def specification(source: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel, list[str
     lost = [Path(mesh.file).name for mesh in spec.meshes]
     for part in [*spec.meshes, *spec.materials, *spec.textures]:
         spec.delete(part)
-    return spec, spec.compile(), lost
+    try:
+        return spec, spec.compile(), lost
+    except ValueError as error:  # of a body whose mass the mesh gives, for one
+        raise ValueError(f"{missing}; without meshes: {error}") from None
 
 
 def _located(source: Path, file: str) -> str:

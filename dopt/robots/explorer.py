@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
 from dopt.robots.body import Body, KnownBody, Motion, listed
-from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner, window_size
+from dopt.robots.friction import BATCH, RIPPLE, SPEEDS, CoulombViscous, FrictionLearner, window_size
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard, Tracker, possible_acceleration
 from dopt.sphere import sphere_maximizer
@@ -65,6 +65,9 @@ RECENT = 10
 
 LIFTED = 2.0
 """Seconds from which a payload is estimated, at least 20 windows."""
+
+UNTOLD = 0.2
+"""Standard error of a payload's mass, as a part of it, from which it is said to be unsure."""
 
 LOST = 50
 """Measurements in turn that make no sense, after which the next is believed."""
@@ -490,6 +493,13 @@ class RobotExplorer:
         spread = np.eye(len(sums)) + rows @ self._unsure @ rows.T
         return bool(sums @ np.linalg.solve(spread, sums) > self._alarm)
 
+    def _led(self, means: tuple[Array, ...], rates: Array | None) -> tuple[Array, ...]:
+        """Return position, rate and acceleration as references give them: free of noise."""
+        if rates is None:
+            return means
+        way = self.dt * np.cumsum(np.vstack([0.0 * rates[:1], rates]), axis=0)
+        return means[0], *self.learner.window.means(way, way)[1:3]
+
     def _carried(self, windows: list[tuple[Array, ...]]) -> Array:
         """Return torques by mass and first moment on the last body, (k, n, 4), parts of limits."""
         q, v, a = (np.array([means[i] for means in windows]) for i in range(3))
@@ -499,22 +509,38 @@ class RobotExplorer:
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
 
-        Columns of the regressor, less friction and ripple as they are known, weighed by the noise.
+        By least squares, with friction and ripple as unsure as they are. References are the
+        instruments: noise of torques accelerates, and would look like less mass.
         """
-        learner = self.learner
-        missing = np.array([learner.innovations(*window)[0] for window in windows])
-        moving = np.isfinite(missing)
-        weights = moving / learner.noise
-        rows = self._carried([means for means, _ in windows]) * weights[..., None]
-        design, wanted = rows.reshape(-1, 4), (np.nan_to_num(missing) * weights).ravel()
-        found, *_ = np.linalg.lstsq(design, wanted, rcond=1e-6)
-        misfit = ((wanted - design @ found) ** 2).sum() / max(moving.sum() - 4, 1)
-        self._unsure = misfit * np.linalg.inv(design.T @ design + 1e-6 * np.eye(4))
+        learner, stacks = self.learner, []
+        pairs = zip(*(learner.innovations(*window)[:2] for window in windows), strict=True)
+        missing, friction = map(np.array, pairs)
+        rows = self._carried([means for means, _ in windows])
+        instruments = self._carried([self._led(*window) for window in windows])
+        for j, unit in enumerate(learner.noise):
+            seen = np.isfinite(missing[:, j])
+            H = friction[seen, j]
+            root = np.linalg.cholesky(np.eye(len(H)) + H @ learner.covariance[j] @ H.T)
+            parts = np.column_stack([rows[seen, j], instruments[seen, j], missing[seen, j]])
+            stacks.append(np.linalg.solve(root, parts / unit))
+        whole = np.concatenate(stacks)
+        X, Z, wanted = whole[:, :4], whole[:, 4:8], whole[:, 8]
+        prior = np.eye(4) / self.body.model.body_mass.sum() ** 2
+        inverse = np.linalg.inv(Z.T @ X + prior)
+        found = inverse @ Z.T @ wanted
+        rest = wanted - X @ found
+        batches = rest[: len(rest) // BATCH * BATCH].reshape(-1, BATCH).sum(axis=1)
+        misfit = max(1.0, (batches**2).sum() / max(len(batches), 1) / BATCH)
+        self._unsure = inverse @ (misfit * Z.T @ Z + prior) @ inverse.T
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)
-        moment = found[1:].round(3)
-        self._say(f"the last body carries {mass:+.3f} kg more, whose first moment is {moment} kg m")
+        moment, error = found[1:].round(3), math.sqrt(self._unsure[0, 0])
+        unsure = ", which these motions hardly tell from its lever and from friction"
+        self._say(
+            f"the last body carries {mass:+.3f} kg more (standard error {error:.2g} kg"
+            f"{unsure * (error > UNTOLD * abs(mass))}), whose first moment is {moment} kg m"
+        )
         self._recent.clear()
         self._payload, self._since = None, 0
 

@@ -145,9 +145,9 @@ def _missing(body: Body, missing: Mapping[str, list[str]]) -> SpecificationError
             blanks = [f"{k}: {'[…, …]' if k == 'position' else '…'}" for k in KINDS if k in kinds]
             lines.append(f"  {name}: {{{', '.join(blanks)}}}")
     return SpecificationError(
-        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N; "
-        f"{WIDE:g} or more in the robot's file counts as none): {said}. Fill in these lines, and "
-        f"give them as a file of limits (--limits FILE):\n" + "\n".join(lines)
+        f"limits are missing, but every joint needs its own (rad or m, per second, N m or N "
+        f"behind the gear; {WIDE:g} or more in the robot's file counts as none): {said}. Fill in "
+        f"these lines, and give them as a file of limits (--limits FILE):\n" + "\n".join(lines)
     )
 
 

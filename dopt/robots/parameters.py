@@ -31,14 +31,14 @@ Centres are in the body's frame, inertias are principal moments about the centre
 """
 
 OF_JOINTS = ("armature", "damping", "frictionloss", "gear")
-"""Kinds of parameters of a joint. A gear is the ratio of torque and command."""
+"""Kinds of parameters of a joint. A gear is the torque at the joint by the commanded one."""
 
 UNITS = {
     **{"mass": "kg", "com_x": "m", "com_y": "m", "com_z": "m"},
     **{"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "armature": "kg m²"},
-    **{"damping": "N m s/rad", "frictionloss": "N m", "gear": ""},
+    **{"damping": "N m s/rad", "frictionloss": "N m", "gear": "N m/N m"},
 }
-OF_SLIDES = {"armature": "kg", "damping": "N s/m", "frictionloss": "N"}
+OF_SLIDES = {"armature": "kg", "damping": "N s/m", "frictionloss": "N", "gear": "N/N"}
 """Units of the kinds of parameters; a joint that slides has ``OF_SLIDES``."""
 
 FRICTION = 0.05
@@ -192,13 +192,14 @@ class Unknowns:
 
     def _parameter(self, kind: str, place: str) -> Parameter:
         body, limits, unit = self.body, self.limits, UNITS[kind]
+        if kind in OF_JOINTS:
+            k = body.joints.index(place)
+            unit = OF_SLIDES[kind] if body.units[k] == "N" else unit
         if kind == "gear":
             return Parameter(kind, place, 1.0, 1.0, unit)
         numbers, at = _numbers(body, body.model, kind, place)
         value = scale = float(numbers[at])
         if kind in OF_JOINTS:
-            k = body.joints.index(place)
-            unit = OF_SLIDES[kind] if body.units[k] == "N" else unit
             typical = FRICTION * limits.torque[k]
             usual = {
                 "armature": 0.1 * self._inertia(k),

@@ -82,6 +82,10 @@ class Report(dict[str, Any]):
 
     def __str__(self) -> str:
         lines = [f"note: {note}" for note in self["notes"]]
+        lines.append(
+            "units: rad and N m of hinges, m and N of slides, at the joint, behind its gear; the "
+            "parameter gear is a joint's torque by the commanded one"
+        )
         lines += _listed(
             self["null"],
             "combination{} of parameters that no motion can identify",

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 NEAR = 5
 """Rows on each side of the first one of a piece by which its velocities are estimated."""
 
+DEFAULTS = ("gear", "armature", "damping")
+"""What default classes may give to an actuator, as MuJoCo names it; early versions lack some."""
+
 
 def sequences(
     body: Body, log: Any, name: str = "log", seconds: float = 1.0
@@ -25,7 +28,19 @@ def sequences(
     """Return a log with the specification of its robot, for ``mujoco.sysid.optimize``.
 
     The specification has a motor, which applies the torque, and a sensor of position for each
-    driven joint, in place of its own actuators and sensors.
+    driven joint, in place of its own actuators and sensors, and an explicit mass for each body.
+    A fit of friction, armature and a mass:
+
+        parameters = sysid.ParameterDict()
+        for name, nominal, change in (
+            ("damping", 0.5, lambda spec, one: spec.joint("a").damping.put(0, one.value)),
+            ("dry", 0.3, lambda spec, one: setattr(spec.joint("a"), "frictionloss", one.value[0])),
+            ("rotor", 0.1, lambda spec, one: setattr(spec.joint("a"), "armature", one.value[0])),
+            ("mass", 1.0, lambda spec, one: setattr(spec.body("hand"), "mass", one.value[0])),
+        ):
+            parameters.add(sysid.Parameter(name, nominal, 0.01, 9.0, modifier=change))
+        residual = sysid.build_residual_fn(models_sequences=[sequences(body, log)])
+        fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual)
 
     Parameters
     ----------
@@ -108,18 +123,28 @@ def _measured(body: Body, dt: float) -> Any:
     for part in [*spec.keys, *spec.actuators, *spec.sensors]:
         spec.delete(part)
     spec.option.timestep = dt
-    # What :class:`Body` moved to the joints, from flags and actuators.
-    if body.model.jnt_actgravcomp.any():
-        for part in spec.bodies:
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    for part in spec.bodies[1:]:  # of geoms, a mass that is set would count for nothing
+        part.explicitinertial, part.fullinertia = True, np.full((6, 1), np.nan)
+        for kind in ("mass", "inertia", "ipos", "iquat"):
+            setattr(part, kind, getattr(body.model, f"body_{kind}")[part.id])
+        # What :class:`Body` moved to the joints, from flags and actuators.
+        if body.model.jnt_actgravcomp.any():
             part.gravcomp = 0.0
     for part in spec.joints:
         part.name = part.name or f"joint{part.id}"
+    empty = mujoco.MjSpec()
+    plain = empty.add_actuator()
     for joint, dof in zip(body.joints, body.dofs, strict=True):
         part, linear = spec.joint(joint), body.model.dof_damping[dof]
         part.armature = body.model.dof_armature[dof]
         part.damping = [linear, *part.damping[1:]] if np.ndim(part.damping) else linear
         motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
+        for kind in DEFAULTS:  # else the file's
+            if hasattr(plain, kind):
+                setattr(motor, kind, getattr(plain, kind))
+        motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
         spec.add_sensor(
             name=f"{joint}_position",
             type=mujoco.mjtSensor.mjSENS_JOINTPOS,

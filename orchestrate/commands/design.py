@@ -45,7 +45,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--limits",
         type=path("--limits"),
         metavar="YAML",
-        help="position, velocity, acceleration and torque of each joint (as in ROBOT)",
+        help="position, velocity, acceleration and torque of each joint, behind its gear, in rad "
+        "and N m, or m and N of slides (as in ROBOT)",
     )
     parser.add_argument("--check", action="store_true", help="say only what is identifiable")
     parser.add_argument("--seed", type=integer("--seed"), default=0, help="seed of the search (0)")
@@ -64,7 +65,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=path("--out"),
         metavar="CSV",
-        help="time, positions, velocities, accelerations, torques; a picture beside it",
+        help="time, positions, velocities, accelerations, torques, in units of the limits; a "
+        "picture beside it",
     )
     parser.add_argument(
         "--ros", type=path("--ros"), metavar="YAML", help="the motion as a ROS JointTrajectory"

@@ -322,7 +322,7 @@ def test_a_slide_has_units_of_its_own(arm: Body, limits: Limits) -> None:
     found = {one.name: one.unit for one in Unknowns(arm, limits, "all").parameters}
     assert found["damping:slide"] == "N s/m" != found["damping:lift"] == "N m s/rad"
     assert [found[f"{kind}:slide"] for kind in ("armature", "frictionloss")] == ["kg", "N"]
-    assert found["gear:slide"] == ""
+    assert found["gear:slide"] == "N/N" != found["gear:lift"] == "N m/N m"
 
 
 @pytest.mark.parametrize(
@@ -370,6 +370,12 @@ NEGATIVE = FLAT.replace('izz="3"', 'izz="-1"')
         (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
         (f'<robot name="r"><link name="a"/>{NEGATIVE}</robot>', "expected: correct it"),
         ("", "robot.xml"),
+        ('<robot xmlns:xacro="x" name="r"><xacro:a/><link/></robot>', r"expand it \(xacro robot.xml"),
+        (
+            """<mujoco><asset><mesh name="m" file="none.stl"/></asset><worldbody><body><joint/>
+            <geom type="mesh" mesh="m"/></body></worldbody></mujoco>""",
+            "none.stl.*; without meshes: .*mass and inertia",
+        ),
     ],
 )
 def test_files_that_are_no_robot_are_refused(tmp_path: Path, text: str, said: str) -> None:
@@ -480,14 +486,18 @@ def test_meshes_of_a_ros_package_are_found_in_its_folder(tmp_path: Path, package
     assert (body.model.nmesh, body.notes) == (1, ())
 
 
-def test_meshes_that_are_not_there_are_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mesh", ["link.stl", "link.dae", "flat.stl"])
+def test_meshes_that_are_not_there_or_not_read_are_said(tmp_path: Path, mesh: str) -> None:
+    """Collada is what many packages of ROS have: such robots were once refused."""
+    (tmp_path / "link.dae").write_text("<COLLADA/>")
+    (tmp_path / "flat.stl").write_bytes(bytes(84))
     (tmp_path / "arm.xml").write_text(
-        """<mujoco><asset><mesh name="m" file="parts/link.stl"/></asset><worldbody>
+        f"""<mujoco><asset><mesh name="m" file="{mesh}"/></asset><worldbody>
         <body><joint name="a"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
         <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
     )
     body = Body.load(tmp_path / "arm.xml")
-    said = "left out: meshes and their contacts, for one is not there: link.stl"
+    said = f"left out: meshes and their contacts, for one cannot be read: {mesh}"
     assert (body.model.ngeom, body.notes) == (0, (said,))
 
 
@@ -518,6 +528,41 @@ def test_what_is_left_out_is_named() -> None:
         "left out: equality constraints: mimic",
         "left out: dry friction of tendons: rope",
     )
+
+
+TIED = """<mujoco><worldbody><body name="one"><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+    <site name="tip"/><site name="end"/><body name="two" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size="0.1"/>
+    </body></body></worldbody><equality>%s</equality><actuator><motor joint="a"/>%s</actuator>
+    </mujoco>"""
+
+
+BOTH = '<motor joint="b"/>'
+
+
+@pytest.mark.parametrize(
+    ("tie", "motors", "tied"),
+    [
+        ('<connect body1="two" anchor="0 0 0"/>', "", True),
+        ('<connect body1="two" anchor="0 0 0" active="false"/>', BOTH, False),
+        ('<weld body1="one" body2="two"/>', "", False),
+        ('<weld body1="one" body2="two"/>', BOTH, True),
+        ('<weld site1="tip" site2="end"/>', BOTH, False),
+        ('<joint joint1="a" joint2="b"/>', "", False),
+        ('<joint joint1="a" joint2="b"/>', BOTH, True),
+        ('<joint joint1="a"/>', "", True),
+        ('<joint joint1="b"/>', "", False),
+    ],
+)
+def test_constraints_that_driven_joints_would_break_are_refused(
+    tie: str, motors: str, tied: bool
+) -> None:
+    """Closed loops were once left out in a note, though no design could be driven."""
+    model = mujoco.MjModel.from_xml_string(TIED % (tie, motors))
+    if not tied:
+        assert Body(model).joints[0] == "a"
+        return
+    with pytest.raises(SpecificationError, match="equality0 ties .*: take it from the file"):
+        Body(model)
 
 
 def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -232,22 +233,28 @@ def test_numbers_of_problems_are_positive(
         Problem(arm, limits, "damping", **({"seconds": 5.0} | {name: value}))
 
 
-def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
+def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_mass(
+    tmp_path: Path,
+) -> None:
+    """A mass that was set once counted for nothing, where the file gives geoms alone; its
+    defaults were those of the motors."""
     from mujoco import sysid
 
     from dopt.robots.sysid import sequences
 
     (tmp_path / "two.xml").write_text(
-        """<mujoco><option timestep="0.002"/><worldbody><body pos="0 0 1">
-      <joint name="a" axis="0 1 0" damping="0.8"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" contype="0" conaffinity="0"/>
-      <body pos="0.3 0 0"><joint name="b" axis="0 1 0" damping="0.3"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" contype="0" conaffinity="0"/>
+        """<mujoco><compiler inertiafromgeom="true"/><option timestep="0.002"/>
+      <default><geom contype="0" conaffinity="0"/><motor gear="3" armature="1"
+      ctrllimited="true" forcelimited="true"/></default><worldbody><body pos="0 0 1">
+      <joint name="a" axis="0 1 0" damping="0.8" frictionloss="0.5" armature="0.2"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
+      <body name="hand" pos="0.3 0 0"><joint name="b" axis="0 1 0" damping="0.3"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>
       </body></body></worldbody></mujoco>"""
     )
     body = Body.load(tmp_path / "two.xml")
     data, times = mujoco.MjData(body.model), 0.002 * np.arange(700)
-    torques = np.stack([4.0 * np.sin(3.0 * times), 2.0 * np.sin(5.0 * times)], axis=1)
+    torques = np.stack([6.0 * np.sin(3.0 * times), 2.0 * np.sin(5.0 * times)], axis=1)
     q = np.zeros((700, 2))
     for k, row in enumerate(torques):
         q[k] = data.qpos
@@ -255,18 +262,13 @@ def test_a_log_for_the_fits_of_mujoco_recovers_damping(tmp_path: Path) -> None:
         mujoco.mj_step(body.model, data)
     columns = {"q_a": q[:, 0], "q_b": q[:, 1], "tau_a": torques[:, 0], "tau_b": torques[:, 1]}
     log = pd.DataFrame({"time": 5.0 + times, **columns})
-    found, parameters = sequences(body, log), sysid.ParameterDict()
-    for joint in body.joints:
-
-        def change(spec: Any, one: Any, joint: str = joint) -> None:
-            spec.joint(joint).damping = [float(np.ravel(one.value)[0]), 0.0, 0.0]
-
-        how = {"nominal": 0.5, "min_value": 0.01, "max_value": 5.0, "modifier": change}
-        parameters.add(sysid.Parameter(joint, **how))
-    residual = sysid.build_residual_fn(models_sequences=[found])
-    fitted, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, verbose=False)
-    assert fitted["a"].value == pytest.approx(0.8, rel=0.02)
-    assert fitted["b"].value == pytest.approx(0.3, rel=0.02)
+    example = (sequences.__doc__ or "").split("mass:\n\n")[1].split("\n\n    Parameters")[0]
+    names: dict[str, Any] = {"sysid": sysid, "sequences": sequences, "body": body, "log": log}
+    exec(textwrap.dedent(example), names)
+    fitted = {name: float(names["fitted"][name].value[0]) for name in names["fitted"].keys()}
+    mass = body.model.body("hand").mass[0]
+    truth = {"damping": 0.8, "dry": 0.5, "rotor": 0.2, "mass": mass}
+    assert fitted == pytest.approx(truth, rel=0.02)
     pieces = sequences(body, log, seconds=0.2)
     assert [len(one.times) for one in pieces.control] == [100] * 7
     for k, state in enumerate(pieces.initial_state):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +41,15 @@ ARM = """
     </body>
   </worldbody>
 </mujoco>
+"""
+
+
+TWO_LINKS = """
+<mujoco><worldbody><body><joint name="shoulder" axis="{}" armature="0.1"/>
+  <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.04" mass="2" contype="0" conaffinity="0"/>
+  <body pos="0.4 0 0"><joint name="elbow" axis="0 1 0" armature="0.05"/>
+  <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1" contype="0" conaffinity="0"/>
+</body></body></worldbody></mujoco>
 """
 
 
@@ -316,6 +326,30 @@ def test_a_payload_is_noticed_said_once_and_weighed() -> None:
     assert "payload" in explorer.warnings[0]
     assert explorer.known.model.body_mass[body.moved[-1]] - own == pytest.approx(0.8, abs=0.15)
     assert body.model.body_mass[body.moved[-1]] == own
+
+
+@pytest.mark.parametrize(("axis", "hardly"), [("0 0 1", True), ("0 1 0", False)])
+def test_a_mass_that_no_torque_of_gravity_tells_apart_is_said_to_be_unsure(
+    axis: str, hardly: bool
+) -> None:
+    """Once it was a third of its value off, or negative, and no error was said.
+
+    About an upright axis only accelerations tell it, which the noise of torques also makes.
+    """
+    text = TWO_LINKS.format(axis)
+
+    def arm() -> tuple[Body, Limits]:
+        half = small()[1]
+        parts = (half.position, half.velocity, half.acceleration, half.torque)
+        kept = [part[[1, 2]] for part in parts]
+        return Body(mujoco.MjModel.from_xml_string(text)), Limits(*kept)
+
+    robot, explorer = pair(2, arm, payload=(4.0, 0.5))
+    explore(robot, explorer, 8.0)
+    said = explorer.warnings[1]
+    mass, error = (float(part) for part in re.findall(r"([-+.0-9]+) kg(?: more|[,)])", said)[:2])
+    assert abs(mass - 0.5) < 3.0 * error
+    assert ("hardly tell" in said) == hardly
 
 
 @pytest.mark.parametrize("friction", ["coulomb_viscous", "network"])
