@@ -24,7 +24,7 @@ GIVES_UP = (0, 75)
 """It may find that something below it is gone for good."""
 
 ENDED_BY_RAY = "Failed to register worker to Raylet"
-"""Ray writes this and ends the driver with 1, without an exception, if its raylet dies meanwhile."""
+"""Ray writes this and ends the driver with 1, without an exception, if its raylet dies then."""
 
 
 @dataclass(frozen=True)
