@@ -296,6 +296,7 @@ def decimals(start: str, stop: str, step: str) -> list[float]:
         ("float(sort(range(3),reverse=true))", [2.0, 1.0, 0.0]),
         ("sort(3,1,2,reverse=true)", [3, 2, 1]),
         ("range(10,0,-3)", [10, 7, 4, 1]),
+        ("range(0,0.9,0.3)", [0.0, 0.3, 0.6]),
         ("range(1e-3,5e-3,1e-3)", [0.001, 0.002, 0.003, 0.004]),
         ("range(1e20,1e20,1)", []),
         ("range(3.0)", [0.0, 1.0, 2.0]),
