@@ -11,11 +11,10 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
-import yaml
 
 from dopt.kernel.cache import COMPILED_SOURCES
 from tests.measure_house import code_lines
-from tests.paths import CONF, EXAMPLE, ROOT, loaded_by
+from tests.paths import ROOT, loaded_by
 
 PACKAGES = ("dopt", "orchestrate", "analysis")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
@@ -273,15 +272,6 @@ two"""
 
 def test_imports_comments_blank_lines_and_docstrings_are_no_code() -> None:
     assert code_lines(MODULE) == 6
-
-
-def test_no_file_of_the_project_sets_the_mode_of_hydra() -> None:
-    folders = [CONF, EXAMPLE / "conf", ROOT / "tests" / "machines" / "conf"]
-    files = [path for folder in folders for path in sorted(folder.rglob("*.yaml"))]
-    assert len(files) > 50
-    for path in files:
-        settings = (yaml.safe_load(path.read_text()) or {}).get("hydra") or {}
-        assert "mode" not in settings, path
 
 
 @pytest.mark.xdist_group("alone")

@@ -12,10 +12,7 @@ import pytest
 from analysis import cli
 from orchestrate import __main__ as orchestrate
 from orchestrate import launch
-from tests.hydra_files import parse_once
 from tests.paths import ROOT
-
-parse_once()
 
 STEPS, STEPS_OF_TASK = ("env.horizon=20",), ("env.horizon=100", "+task.iterations=1")
 FRAMES = ["--frames", "4"]

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import pytest
 
+from analysis.data.matching import Filter
+from analysis.tables.variants import VariantGroup, variant_groups
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fill, make_grid
@@ -72,3 +74,9 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> str:
 def reader(url: str) -> Iterator[Reader]:
     with Reader.open(url) as opened:
         yield opened
+
+
+@pytest.fixture
+def group(reader: Reader) -> VariantGroup:
+    """Return the variants of the pendulum."""
+    return variant_groups(reader, Filter(("pendulum",)))[0]

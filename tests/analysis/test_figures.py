@@ -168,16 +168,6 @@ def test_diverged_trials_are_counted_and_said(learners: str) -> None:
     assert "random, adam: 2/3, 1 diverged" in words
 
 
-def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> None:
-    given = ("--db", learners, "--out", str(tmp_path), "--allow-partial")
-    assert main(["figures", *given, "--only", "figure6_pareto"]) == 0
-    assert (tmp_path / "figure6_pareto.png").read_bytes().startswith(b"\x89PNG")
-    with (tmp_path / "figure6_pareto.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 20
-    assert {row["on_front"] for row in rows} == {"True", "False"}
-
-
 def test_the_time_between_two_steps_is_marked(learners: str) -> None:
     first, *_ = draw(points_of(learners).reset_index(drop=True).assign(limit_us=10.0)).axes
     assert [text.get_text() for text in first.texts] == ["dt = 0.01 ms"]

@@ -69,11 +69,6 @@ def logs_of(policy: str, seeds: Iterable[int] = SEEDS, **sections: Any) -> np.nd
     return np.log([fake_result(spec).loss[-1] for spec in specs])
 
 
-@pytest.fixture
-def pendulum(reader: Reader) -> VariantGroup:
-    return variant_groups(reader, Filter(("pendulum",)))[0]
-
-
 @pytest.fixture(scope="module")
 def tables(url: str) -> pd.DataFrame:
     """Return the table of the report."""
@@ -88,9 +83,9 @@ def table(tables: pd.DataFrame) -> pd.DataFrame:
     return tables[tables.env == "pendulum"].set_index("variant")
 
 
-def test_every_variant_has_another_label(pendulum: VariantGroup) -> None:
-    assert pendulum.reference.label == "D-optimal"
-    assert [one.label for one in pendulum.variants[1:]] == [
+def test_every_variant_has_another_label(group: VariantGroup) -> None:
+    assert group.reference.label == "D-optimal"
+    assert [one.label for one in group.variants[1:]] == [
         "D-optimal, adam",
         "D-optimal, form=dual",
         "oracle",

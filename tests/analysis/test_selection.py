@@ -25,14 +25,7 @@ from analysis.data.matching import (
     difference,
     newest,
 )
-from analysis.data.selection import (
-    Entry,
-    Selection,
-    environment_rank,
-    policy_rank,
-    ranges,
-    select,
-)
+from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, ranges, select
 from analysis.tables.comparisons import compare_policies, references
 from dopt import registry
 from dopt.policies import POLICIES

@@ -221,11 +221,6 @@ def test_a_database_without_a_finished_trial_is_refused(
     assert "No selected trial is done" in capsys.readouterr().err
 
 
-@pytest.fixture
-def group(reader: Reader) -> VariantGroup:
-    return variant_groups(reader, Filter(("pendulum",)))[0]
-
-
 def control_of(reader: Reader, group: VariantGroup) -> pd.DataFrame:
     """Return the rows of the table of control of an environment, by policy."""
     table = tabulate_control_of(reader, [group])

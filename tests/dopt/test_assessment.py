@@ -125,7 +125,8 @@ def test_policies_of_one_seed_share_what_is_not_theirs(
 def test_with_the_true_model_learned_both_costs_are_one() -> None:
     spec = short("pendulum", "oracle")
     truth = [getattr(spec.system, name) for name in spec.system.linear_parameters]
-    rows = assess(spec, _task(spec), {0: np.array(truth)}, np.zeros((1, 2)))
+    assert spec.task is not None
+    rows = assess(spec, spec.task, {0: np.array(truth)}, np.zeros((1, 2)))
     values = {row.measure: row.value for row in rows}
     assert values["control_cost"] == pytest.approx(values["true_model_cost"], rel=1e-9)
     assert values["free_run_error"] < 1e-12
@@ -139,11 +140,6 @@ def test_nothing_is_said_of_what_a_diverged_trial_did_not_reach() -> None:
     assert result.diverged_at is not None
     assert 1 < result.diverged_at < 30
     assert {row.t for row in result.assessments} == {0, 1}
-
-
-def _task(spec: TrialSpec) -> assessment.Control:
-    assert spec.task is not None
-    return spec.task
 
 
 BOX = ((-1.0, 1.0), (0.0, 4.0))

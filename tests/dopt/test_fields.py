@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar, Optional, Union
 
 import pytest
@@ -260,18 +259,6 @@ def test_a_section_of_a_users_class_is_completed_where_it_is_loaded() -> None:
     stored = json.loads(spec.config_json)
     assert "delay" not in stored["policy"]
     assert completed(stored)["policy"]["delay"] == 3  # type: ignore[index]
-
-
-def test_the_text_that_is_stored_is_the_one_whose_hash_is_the_key(tmp_path: Path) -> None:
-    from orchestrate.store.maintenance import examine
-    from orchestrate.store.records import trial_key
-    from tests.analysis.synthetic import fill
-
-    for spec in (PLAIN, FRESH):
-        assert trial_key(spec.config_json, spec.seed) == spec.trial_key
-    url = f"sqlite:///{tmp_path}/results.db"
-    fill(url, [PLAIN, FRESH])
-    assert examine(url) == []
 
 
 class Heavy(Pendulum):

@@ -394,11 +394,7 @@ CASES: list[tuple[Callable[..., Any], tuple[Any, ...], str]] = [
     ),
     (TrialSpec.from_names, ("pendulum", 3), r"configuration key 'policy' is 3, but a section"),
     (TrialSpec.of_system, (Pendulum, "random"), r"is the class Pendulum, but an object such as"),
-    (
-        TrialSpec.of_system,
-        ("pendulum", "random"),
-        r"is 'pendulum', .* TrialSpec\.from_names,",
-    ),
+    (TrialSpec.of_system, ("pendulum", "random"), r"is 'pendulum', .* TrialSpec\.from_names,"),
     (TrialSpec.of_system, (Pendulum(), None), r"configuration key 'policy' is None, but a section"),
     (run_trial, ("pendulum",), r"run_trial was given 'pendulum', but a TrialSpec is expected"),
 ]

@@ -278,6 +278,16 @@ class Lab:
         command = (sys.executable, "-m", "tests.machines.lab", self.database.url)
         return Outcome.from_json(self.host("db").run(*command))
 
+    def completed(
+        self, undisturbed: Outcome, *launches: Process, seeds: int | None = None
+    ) -> Outcome:
+        """Wait for the ends of launches, check that the first trials, or all, are done once."""
+        for launched in launches:
+            assert launched.wait() == 0, launched.output
+        outcome = self.outcome()
+        outcome.check_complete(undisturbed, seeds)
+        return outcome
+
 
 def environment() -> dict[str, str]:
     """Return what every program on every host is given."""

@@ -27,9 +27,7 @@ def test_all_hosts_work(lab: Lab, undisturbed: Outcome) -> None:
         begun(lab, launched, worker)
     for worker in ("w1", "w2"):
         let_go(home_of(lab, worker))
-    assert launched.wait() == 0, launched.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed)
+    outcome = lab.completed(undisturbed, launched)
     assert [node for node, _ in outcome.nodes] == ["w1", "w2"]
     assert outcome.launches == [(1, "done")]
 
@@ -46,9 +44,7 @@ def test_a_host_that_joins_in_mid_run_is_used(
         lambda: f"trial on w2:\n{launched.output}",
     )  # fmt: skip
     measured("host added: first trial of it", seconds)
-    assert launched.wait() == 0, launched.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed)
+    outcome = lab.completed(undisturbed, launched)
     assert [node for node, _ in outcome.nodes] == ["w1", "w2"]
 
 
@@ -70,9 +66,7 @@ def test_a_host_that_is_lost_costs_nothing(
             seconds = lab.until_rows(launched, "attempt", RELEASED)
         let_go(home_of(lab, "w1"))  # a host that is back before Ray gives it up gets trials again
     measured(f"{fault}: its trials wait again", seconds)
-    assert launched.wait() == 0, launched.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed)
+    outcome = lab.completed(undisturbed, launched)
     assert {row[3] for row in outcome.attempts if row[2] == "released"} == {"node lost"}
 
 
@@ -82,9 +76,7 @@ def test_a_short_cut_is_not_even_noticed(lab: Lab, undisturbed: Outcome) -> None
     lab.until_done(launched, 4)
     with lab.network.link_cut(lab.host("w1")):
         time.sleep(1.0)
-    assert launched.wait() == 0, launched.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed)
+    outcome = lab.completed(undisturbed, launched)
     assert not outcome.attempts_of("released")
 
 
@@ -124,9 +116,7 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     with lab.network.cut_between(lab.host("head"), lab.host("w1")):
         lab.until_head_lost("w1")
         let_go(home_of(lab, "w1"))
-        assert launched.wait() == 0, launched.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed, seeds=4)
+        outcome = lab.completed(undisturbed, launched, seeds=4)
     assert outcome.attempts_of("done")[seed][4] == "w1"
     assert len(outcome.attempts) == 4
 
@@ -148,9 +138,7 @@ def test_a_host_of_other_code_is_refused_before_it_computes_anything(lab: Lab) -
 
 def begun(lab: Lab, launched: Process, host: str) -> int:
     """Return the first trial of the host, once it has begun."""
-    until(
-        lambda: notes(lab, host, "begun"), lambda: f"trial on {host}:\n{launched.output}"
-    )  # fmt: skip
+    until(lambda: notes(lab, host, "begun"), lambda: f"trial on {host}:\n{launched.output}")
     return next(iter(notes(lab, host, "begun")))
 
 
@@ -170,15 +158,14 @@ def test_a_token_opens_the_cluster_and_appears_nowhere(lab: Lab, undisturbed: Ou
     assert refused.wait() == 75
     assert "error: Ray cannot be reached" in refused.output
     launched = lab.launch(seeds=2, **secret)
-    assert launched.wait() == 0, launched.output
-    lab.outcome().check_complete(undisturbed, seeds=2)
+    lab.completed(undisturbed, launched, seeds=2)
     everything = lab.host("db").run("pg_dump", "-h", "/tmp", "-U", "postgres", "postgres")
     assert token not in refused.output + launched.output + everything
 
 
 @pytest.mark.parametrize("fault", ["power off", "gcs_server stopped"])
 def test_without_its_head_a_launch_ends_and_a_new_cluster_completes_it(
-    lab: Lab, undisturbed: Outcome, measured: Callable[[str, float], None], fault: str
+    lab: Lab, undisturbed: Outcome, measured: Measured, fault: str
 ) -> None:
     lab.start_cluster("w1", "w2")
     launched = lab.launch(witness=True)
@@ -204,14 +191,9 @@ def test_without_its_head_a_launch_ends_and_a_new_cluster_completes_it(
         list(threads.map(leave, map(lab.host, ("desk", "w1", "w2"))))
     lab.start_cluster("w1", "w2")
     again = lab.launch()
-    assert again.wait() == 0, again.output
+    outcome = lab.completed(undisturbed, again)
     assert f"{before} of {len(undisturbed.trials)} already done" in again.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed)
     assert outcome.launches == [(1, "failed"), (2, "done")]
-
-
-Measured = Callable[[str, float], None]
 
 
 @pytest.mark.parametrize("mode", ["fast", "immediate"])
@@ -229,9 +211,7 @@ def test_a_launch_waits_for_a_server_that_restarts(
     before = lab.done()
     lab.until_done(launched, before + 1)
     measured(f"server restarted, {mode}: next trial stored", time.monotonic() - start)
-    assert launched.wait() == 0, launched.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed)
+    outcome = lab.completed(undisturbed, launched)
     assert outcome.launches == [(1, "done")]
 
 
@@ -249,10 +229,7 @@ def test_the_late_outcomes_of_a_launch_that_was_cut_off_are_refused(
             "launch cut off from the database, lease of 5 s: its trials wait again",
             lab.until_rows(other, "attempt", "outcome = 'lost'"),
         )
-    assert other.wait() == 0, other.output
-    assert cut_off.wait() == 0, cut_off.output
-    outcome = lab.outcome()
-    outcome.check_complete(undisturbed, seeds=10)
+    outcome = lab.completed(undisturbed, other, cut_off, seeds=10)
     lost = outcome.attempts_of("lost")
     finished = read_notes(lab.host("desk").folder / "home", "finished")
     late = set(lost) & set(finished)

@@ -16,12 +16,9 @@ from orchestrate.executors.base import Run
 from orchestrate.program import readable_streams
 from orchestrate.runner.start import Output, Work, launch_grid
 from orchestrate.store import LaunchRecord, Reader
-from tests.hydra_files import parse_once
 from tests.orchestrate.standins import quick, specification
 
 RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
-
-parse_once()
 
 
 class Launches:

@@ -150,11 +150,7 @@ class JobController:
 def environment_of_pods(database: str) -> dict[str, str]:
     """Return the variables of the pods of these processes."""
     folder = Path(sys.executable).parent
-    return {
-        **os.environ,
-        "PATH": f"{folder}:{os.environ['PATH']}",
-        "DOPT_DB": database,
-    }
+    return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}", "DOPT_DB": database}
 
 
 TRIALS = 2_000

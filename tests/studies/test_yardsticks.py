@@ -118,14 +118,20 @@ def test_a_trial_that_diverged_counts_with_an_infinite_error(tmp_path: Path) -> 
     assert 0.0 <= row.violations < 1.0
 
 
-def test_other_bounds_are_another_question(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+NARROW = disk("random", 0).to_mapping() | {"limits": LIMITS | {"bounds": {"ω": [-2.0, 2.0]}}}
+
+
+@pytest.mark.parametrize("other", [TrialSpec.from_mapping(NARROW), trial("pendulum", "random")])
+def test_a_database_without_trials_of_a_published_table_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], other: TrialSpec
 ) -> None:
+    """Trials within other bounds answer another question."""
     address = f"sqlite:///{tmp_path}/other.db"
-    narrow = disk("random", 0).to_mapping() | {"limits": LIMITS | {"bounds": {"ω": [-2.0, 2.0]}}}
-    fill(address, [TrialSpec.from_mapping(narrow)], edit=simulated)
+    fill(address, [other], edit=simulated)
     assert main(["--db", address, "--out", str(tmp_path)]) == 2
-    assert "holds no trials of a published table" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "holds no trials of a published table" in said
+    assert "experiment=flex_table1 or flex_table3 or flex_star or active_sysid" in said
 
 
 LEARNED: dict[str, dict[str, Any]] = {
@@ -190,18 +196,6 @@ def test_medians_and_ratios_of_pendulums_follow_from_the_trials(made: Made) -> N
         follows(made, "flex_table3", keys, "samples", (size, "d_optimal"))
     assert "published: FLEX" in made.shown
     assert table_3.published_exponent("FLEX") == pytest.approx(1.18, abs=0.005)
-
-
-def test_a_database_without_such_trials_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    address = f"sqlite:///{tmp_path}/other.db"
-    fill(address, [trial("pendulum", "random")], edit=simulated)
-    assert main(["--db", address, "--out", str(tmp_path)]) == 2
-    assert (
-        "experiment=flex_table1 or flex_table3 or flex_star or active_sysid"
-        in capsys.readouterr().err
-    )
 
 
 BOX = {"name": "grey_box", "unknown": list(CENTRE), "initial": [0.1, 0.1]}

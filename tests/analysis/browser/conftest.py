@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
 
 import pytest
+from playwright.sync_api import Browser, Page
 from starlette.testclient import TestClient
 
 from analysis.serve.app import create_app
 from orchestrate.store import Reader
-from tests.analysis.browser import grids
+from tests.analysis.browser import chromium, grids
 from tests.orchestrate.store.databases import new_schema
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
 
 BASE = "http://127.0.0.1:8000"
 
@@ -56,8 +53,6 @@ def url(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     """Return one Chromium for all tests of this folder."""
-    from tests.analysis.browser import chromium
-
     with chromium.opened() as opened:
         yield opened
 
@@ -65,8 +60,6 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="package")
 def address(sqlite_grid: str) -> Iterator[str]:
     """Return the address of a server of the mixed grid."""
-    from tests.analysis.browser import chromium
-
     with chromium.served(sqlite_grid) as found:
         yield found
 
@@ -74,16 +67,12 @@ def address(sqlite_grid: str) -> Iterator[str]:
 @pytest.fixture(scope="package")
 def variants(variants_grid: str) -> Iterator[str]:
     """Return the address of a server of the grid of variants."""
-    from tests.analysis.browser import chromium
-
     with chromium.served(variants_grid) as found:
         yield found
 
 
 @pytest.fixture
 def page(browser: Browser, address: str) -> Iterator[Page]:
-    from tests.analysis.browser import chromium
-
     with chromium.strict_page(browser, address) as opened:
         yield opened
 

@@ -31,9 +31,15 @@ def mixed(url: str) -> None:
         ("pendulum",), ("d_optimal", "random"), range(4), model={"width": 4}, **SHORT
     )
     left = [spec for spec in specs if spec.policy.name == "periodic" and spec.seed > 1]
-    diverged = {_key(specs, "cartpole", "random", 2): 17}
-    fill(url, specs, skipped=left, diverged=diverged)
-    fail_one(url, left[0])
+    [lost] = [
+        s for s in specs if (s.system.name, s.policy.name, s.seed) == ("cartpole", "random", 2)
+    ]
+    fill(url, specs, skipped=left, diverged={lost.trial_key: 17})
+    with Store.open(url) as store:
+        launch = begin(store)
+        (claim,) = store.claim(launch, [left[0].trial_key])
+        assert store.fail(claim, FAILURE, RUN)
+        store.end_launch(launch, "done")
 
 
 def variants(url: str) -> None:
@@ -50,15 +56,6 @@ def variants(url: str) -> None:
         ("pendulum", "quadrotor"), ("d_optimal", "random"), range(3), **SHORT, **task
     )
     fill(url, specs)
-
-
-def fail_one(url: str, spec: TrialSpec) -> None:
-    """Claim a trial in a new launch and fail it."""
-    with Store.open(url) as store:
-        launch = begin(store)
-        (claim,) = store.claim(launch, [spec.trial_key])
-        assert store.fail(claim, FAILURE, RUN)
-        store.end_launch(launch, "done")
 
 
 def finish(store: Store, launch: int, spec: TrialSpec) -> None:
@@ -93,14 +90,6 @@ def all_diverged(url: str) -> None:
     """Make a database of which every trial diverged, one of them at once."""
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(3), **SHORT)
     fill(url, specs, diverged={spec.trial_key: 5 * spec.seed for spec in specs})
-
-
-def _key(specs: list[TrialSpec], env: str, policy: str, seed: int) -> str:
-    return next(
-        spec.trial_key
-        for spec in specs
-        if (spec.system.name, spec.policy.name, spec.seed) == (env, policy, seed)
-    )
 
 
 def token(client: TestClient) -> str:

@@ -142,28 +142,24 @@ def test_the_list_sorts_filters_and_turns_pages(page: Page) -> None:
 
 def test_sql_answers_refuses_and_downloads(browser: Browser, address: str) -> None:
     with chromium.strict_page(browser, address, complaint="status of 400") as page:
-        use_sql(page)
-
-
-def use_sql(page: Page) -> None:
-    page.goto("/sql")
-    page.get_by_role("link", name="Final losses").click()
-    expect(page.get_by_label("Statement")).to_have_value(re.compile("avg"))
-    expect(page.locator("#answer")).to_have_count(0)
-    page.get_by_role("button", name="Run").click()
-    expect(page.locator("#answer tbody tr")).to_have_count(12)
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Download CSV").click()
-    assert download.value.path().read_text().startswith("env,label,n,mean")
-    box = page.get_by_label("Statement")
-    box.fill("DELETE FROM trial")
-    box.press("Control+Enter")
-    expect(page.get_by_role("alert")).to_contain_text("The query failed")
-    expect(box).to_have_value("DELETE FROM trial")
-    box.fill("SELECT trial_key FROM v_trial WHERE status = 'failed'")
-    page.get_by_role("button", name="Run").click()
-    page.locator("#answer tbody a").click()
-    expect(page.locator("h1")).to_contain_text("pendulum, periodic")
+        page.goto("/sql")
+        page.get_by_role("link", name="Final losses").click()
+        expect(page.get_by_label("Statement")).to_have_value(re.compile("avg"))
+        expect(page.locator("#answer")).to_have_count(0)
+        page.get_by_role("button", name="Run").click()
+        expect(page.locator("#answer tbody tr")).to_have_count(12)
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Download CSV").click()
+        assert download.value.path().read_text().startswith("env,label,n,mean")
+        box = page.get_by_label("Statement")
+        box.fill("DELETE FROM trial")
+        box.press("Control+Enter")
+        expect(page.get_by_role("alert")).to_contain_text("The query failed")
+        expect(box).to_have_value("DELETE FROM trial")
+        box.fill("SELECT trial_key FROM v_trial WHERE status = 'failed'")
+        page.get_by_role("button", name="Run").click()
+        page.locator("#answer tbody a").click()
+        expect(page.locator("h1")).to_contain_text("pendulum, periodic")
 
 
 def test_a_choice_while_the_page_loads_is_applied(page: Page) -> None:
@@ -260,17 +256,6 @@ def test_small_databases_are_shown_without_complaint(
     if state is not grids.nothing:
         page.locator("tbody a").last.click()
         page.wait_for_selector("#charts[data-drawn]")
-
-
-def test_the_same_pages_over_postgresql(show: Callable[[str], Page], postgresql_grid: str) -> None:
-    page = show(postgresql_grid)
-    page.goto("/")
-    expect(page.locator(".tile")).to_have_count(12)
-    page.goto("/curves?env=cartpole")
-    expect(page.locator("#legend tbody tr")).to_have_count(5)
-    page.goto("/trials?status=diverged")
-    page.locator("tbody a").click()
-    page.wait_for_selector("#charts[data-drawn]")
 
 
 DESK: ViewportSize = {"width": 1400, "height": 900}

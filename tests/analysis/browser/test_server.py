@@ -36,13 +36,6 @@ from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until
 
 
-@pytest.fixture
-def taken() -> Iterator[int]:
-    """Return a port that somebody listens at until the test ends."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        yield listening.getsockname()[1]
-
-
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -65,10 +58,9 @@ def test_a_wrong_request_is_one_sentence(
     assert captured.out == ""
 
 
-def test_a_port_that_is_taken_is_one_sentence(
-    capsys: pytest.CaptureFixture[str], taken: int
-) -> None:
-    assert main(["serve", "--port", str(taken)]) == 2
+def test_a_port_that_is_taken_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        assert main(["serve", "--port", str(listening.getsockname()[1])]) == 2
     assert "--port 0 takes any free port" in capsys.readouterr().err
 
 

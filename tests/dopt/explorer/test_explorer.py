@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -326,16 +327,12 @@ def test_a_plan_that_fails_is_said_once_and_costs_no_state(deadline: float | Non
     explorer = Explorer(MOTOR, policy="d_optimal", steps=30, deadline=deadline)
     x = drive(explorer, 3)
     planner: Any = explorer._planner
-    make, planner._make = planner._make, _failing
+    make, planner._make = planner._make, Mock(side_effect=RuntimeError("no plan"))
     with pytest.raises(RuntimeError, match="no plan"):
         explorer.ask(x)
     planner._make = make
     assert explorer.tell(following(x, np.array([1.0])), applied=[1.0])
     explorer.close()
-
-
-def _failing() -> None:
-    raise RuntimeError("no plan")
 
 
 @pytest.mark.filterwarnings("ignore::dopt.errors.ScaleWarning")

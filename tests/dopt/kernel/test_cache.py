@@ -79,11 +79,6 @@ def found(function: FunctionType) -> bool:
     return bool(compiled.stats.cache_hits)
 
 
-def code_and_mark(folder: Path) -> tuple[Path, Path]:
-    [code], [mark] = folder.rglob("*.nbi"), folder.glob("*.complete")
-    return code, mark
-
-
 def beginning(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -117,7 +112,7 @@ def test_what_is_damaged_is_compiled_again_and_said(
 ) -> None:
     assert not found(triple)
     assert found(triple)
-    path = code_and_mark(folder)[which]
+    path = [*folder.rglob("*.nbi"), *folder.glob("*.complete")][which]
     damage(path)
     caplog.clear()
     code_lost = which == 0

@@ -31,7 +31,6 @@ TRACEBACK = (
     "    raise ZeroDivisionError\n"
     "ZeroDivisionError: seed {seed} is broken\n"
 )
-"""Numbers that a conversion to text or to another type would change."""
 
 
 @dataclass

@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy.engine import make_url
 
 from orchestrate.store import Reader, Store
-from orchestrate.store.maintenance import back_up
-from orchestrate.store.merge import merge
 from orchestrate.store.records import utc_text
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer, on_both
-from tests.orchestrate.store.databases import execute, restored
+from tests.orchestrate.store.databases import execute, file_of, restored
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, everything, result, run_all
 from tests.orchestrate.store.released import restore
 
@@ -46,7 +43,7 @@ class TestUpgrade:
         assert f"run 'python -m orchestrate upgrade --db {url}'" in refused.err
         answer = command("upgrade")
         assert answer.code == 0
-        backup = f"a backup is in the file {_path(url)}.v5-b"
+        backup = f"a backup is in the file {file_of(url)}.v5-b"
         assert f"went from schema 5 to {SCHEMA_VERSION}; {backup}" in answer.out
         assert command("status").code == 0
         assert "there is nothing to do" in command("upgrade").out
@@ -58,11 +55,7 @@ class TestUpgrade:
             "safe_url": url, "before": 5, "after": SCHEMA_VERSION, "backup": None, "packed": 0,
             "changed": True,
         }  # fmt: skip
-        assert not list(_path(url).parent.glob("*backup*"))
-
-
-def _path(url: str) -> Path:
-    return Path(str(make_url(url).database))
+        assert not list(file_of(url).parent.glob("*backup*"))
 
 
 class TestMerge:
@@ -109,15 +102,6 @@ class TestDoctor:
         document = command("doctor", "--json").document
         assert [one["severity"] for one in document][:2] == ["error", "error"]
         assert all(one["advice"] for one in document)
-
-    def test_what_it_advises_helps(self, command: Run, url: str, tmp_path: Path) -> None:
-        restore(5, url)
-        command("upgrade", "--no-backup")
-        execute(url, "DELETE FROM trajectory WHERE trial_id = 1")
-        new = f"sqlite:///{tmp_path}/new.db"
-        assert len(merge(new, url).incomplete) == 1
-        with Reader.open(new) as reader:
-            assert sum(config.n_done for config in reader.configs()) == 3
 
 
 TABLES = ("trial", "step", "curve", "trajectory", "attempt", "config", "error")
@@ -184,15 +168,6 @@ class TestBackup:
         assert answer.code == 2
         assert "exists, a new one is expected" in answer.err
         assert copy.read_text() == "mine"
-
-
-def test_without_the_program_of_the_server(
-    postgresql_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Store.open(postgresql_url).close()
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(Exception, match="pg_dump, which is not installed"):
-        back_up(postgresql_url, tmp_path / "copy")
 
 
 @pytest.mark.usefixtures("grid")
@@ -285,15 +260,6 @@ def test_failed_trials_wait_again(ask: Run, url: str) -> None:
     changed = {key for key, status in statuses(url).items() if status != before[key]}
     assert changed == {spec.trial_key for spec in BROKEN}
     assert "There is no failed trial to retry." in ask("retry", "failed").out
-
-
-@on_both
-def test_diverged_trials_lose_what_they_had_written(ask: Run, url: str) -> None:
-    assert "1 diverged trial waits" in ask("retry", "diverged").out
-    assert statuses(url)[BAD.trial_key] == "pending"
-    with Reader.open(url) as reader:
-        assert len(reader.trials(BAD.config_key)) == 3
-        assert reader.curves(BAD.config_key).values.shape[0] == 0
 
 
 def test_all_of_them(ask: Run, url: str) -> None:

@@ -100,31 +100,22 @@ class TestOnce:
 
 
 @on_both
-def test_a_dead_launch_is_called_dead(open_store: Callable[..., Store], command: Run) -> None:
-    dead = open_store()
-    launch = dead.begin_launch(LAUNCH)
-    dead.claim(launch, dead.register(launch, [Spec()]).todo)
-    dead.close()
-    with open_store()._backend.transaction() as connection:
-        connection.exec_driver_sql("UPDATE launch SET lease_until = 0")  # long ago, on PostgreSQL
-    assert ": dead; run the same launch command again to continue" in command("status").out
-    assert command("status", "--json").document["launches"][0]["alive"] is False
-
-
-@on_both
-def test_a_dead_launch_that_left_nothing_has_nothing_to_continue(
-    open_store: Callable[..., Store], command: Run
+@pytest.mark.parametrize("left", [True, False])
+def test_a_dead_launch_is_called_dead_and_continued_where_it_left_something(
+    open_store: Callable[..., Store], command: Run, left: bool
 ) -> None:
     dead = open_store()
     launch = dead.begin_launch(LAUNCH)
     (claim,) = dead.claim(launch, dead.register(launch, [Spec()]).todo)
-    assert dead.commit(claim, result(), run_now())
+    assert left or dead.commit(claim, result(), run_now())
     dead.close()
     with open_store()._backend.transaction() as connection:
         connection.exec_driver_sql("UPDATE launch SET lease_until = 0")  # long ago, on PostgreSQL
     said = command("status").out
     assert ": dead" in said
-    assert "continue" not in said
+    assert (": dead; run the same launch command again to continue" in said) == left
+    assert ("continue" in said) == left
+    assert command("status", "--json").document["launches"][0]["alive"] is False
 
 
 def test_without_a_launch_it_says_how_to_go_on(store: Store, command: Run) -> None:

@@ -10,12 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreError
 from orchestrate.store.maintenance import Finding, examine
 from orchestrate.store.schema import STEP_VALUES
-from tests.orchestrate.store.databases import columns, contents, execute
+from tests.orchestrate.store.databases import columns, contents, execute, file_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result, run_all
 
 Take = Callable[..., list[Claim]]
@@ -150,11 +149,6 @@ def test_a_launch_that_lives_is_no_finding(store: Store, take: Take, url: str) -
     assert examine(url) == []
 
 
-@pytest.fixture
-def path(sqlite_url: str) -> Path:
-    return Path(str(make_url(sqlite_url).database))
-
-
 @pytest.fixture(scope="module")
 def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a SQLite database with forty long trials, in one file."""
@@ -167,7 +161,8 @@ def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def file(forty: Path, path: Path) -> Path:
+def file(forty: Path, sqlite_url: str) -> Path:
+    path = file_of(sqlite_url)
     path.parent.mkdir()
     shutil.copy(forty, path)
     return path

@@ -183,18 +183,13 @@ def test_a_late_outcome_is_refused(db: Database, again: str) -> None:
     np.testing.assert_array_equal(db.curves().values[0], result(2).loss)
 
 
-def _with_hole() -> FakeResult:
-    hole = result()
-    hole.loss[2] = np.nan
-    return hole
-
-
+HOLE = np.where(np.arange(HORIZON) == 2, np.nan, result().loss)
 MALFORMED = {
     "'learn_us' has shape": replace(result(), learn_us=np.zeros(HORIZON - 1)),
     "'states' has shape": replace(result(), states=np.zeros((HORIZON, 4))),
     "'inputs' has shape": replace(result(), inputs=np.zeros(HORIZON)),
     "'parameters' has shape": replace(result(), parameters=np.zeros((2, 2))),
-    "loss of step 2 is not finite": _with_hole(),
+    "loss of step 2 is not finite": replace(result(), loss=HOLE),
     "'diverged_at' is 7": replace(result(), diverged_at=HORIZON),
     "losses after the divergence": replace(result(), diverged_at=3),
     f"8 steps, expected the horizon {HORIZON}": result(horizon=8),

@@ -35,7 +35,7 @@ from orchestrate.store.records import Array
 from tests.orchestrate.store.conftest import Database
 from tests.orchestrate.store.databases import execute, file_of, schema_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result, run_all
-from tests.waiting import PATIENCE_SECONDS, until
+from tests.waiting import PATIENCE_SECONDS
 
 
 @pytest.fixture
@@ -55,13 +55,6 @@ def sleeper(url: str, open_store: Callable[..., Store]) -> tuple[Store, int, Cla
 def end_lease(url: str, launch: int) -> None:
     """Let the lease of a launch run out, as time does."""
     execute(url, f"UPDATE launch SET lease_until = 0 WHERE launch_id = {launch}")
-
-
-def test_a_lease_runs_out_by_itself(store: Store, open_store: Callable[..., Store]) -> None:
-    late = open_store(3.0)
-    launch = late.begin_launch(LAUNCH)
-    assert len(late.claim(launch, late.register(launch, [Spec()]).todo)) == 1
-    until(store.recover)
 
 
 def test_claims_are_free_after_the_lease(
@@ -367,15 +360,12 @@ def test_a_refused_login(postgresql_url: str, wrong: str, reason: str) -> None:
     assert not caught.value.transient
 
 
-def _write_read_only(store: Store) -> None:
-    with store._backend.transaction() as connection:
+def test_a_read_only_server(store: Store) -> None:
+    writing = store._backend.transaction()
+    refused = pytest.raises(StoreUnavailableError, match="server is read-only")
+    with refused as caught, writing as connection:
         connection.exec_driver_sql("SET TRANSACTION READ ONLY")
         connection.exec_driver_sql("DELETE FROM trial")
-
-
-def test_a_read_only_server(store: Store) -> None:
-    with pytest.raises(StoreUnavailableError, match="server is read-only") as caught:
-        _write_read_only(store)
     assert not caught.value.transient
 
 

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 from sqlalchemy import event
-from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreError, StoreUnavailableError, sqlite
 from orchestrate.store.maintenance import examine
 from orchestrate.store.sqlite import _is_read_only, read_address
+from tests.orchestrate.store.databases import file_of
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
 from tests.orchestrate.store.processes import hear, kill, run_and_stop, running, without_rights
 
@@ -31,7 +31,7 @@ def url(sqlite_url: str) -> str:
 
 @pytest.fixture
 def path(url: str) -> Path:
-    return Path(str(make_url(url).database))
+    return file_of(url)
 
 
 def test_tables_are_strict_and_steps_have_no_rowid(store: Store, path: Path) -> None:
