@@ -80,6 +80,14 @@ def _run(arguments: argparse.Namespace) -> ExitCode:
 
     if arguments.check and (arguments.out or arguments.ros):
         raise UsageError("--check designs no motion that could be written: leave out --out, --ros.")
+    out, read = arguments.out, (arguments.robot, arguments.limits)
+    files = [one.resolve() for one in (out, out and out.with_suffix(".png"), arguments.ros) if one]
+    if {*files} & {one.resolve() for one in read if one} or len({*files}) < len(files):
+        raise UsageError(
+            f"--out {out} with its picture, --ros {arguments.ros} and the files that are read have "
+            f"a name twice, but each is another file: give names such as --out motion.csv --ros "
+            f"motion.yaml."
+        )
     body = Body.load(arguments.robot)
     limits = Limits.of(body, arguments.limits)
     nuisance = FRICTION if arguments.nuisance is None else arguments.nuisance

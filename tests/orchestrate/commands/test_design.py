@@ -121,3 +121,25 @@ def test_slow_sensors_hide_no_parameter_and_short_motions_have_rows(
     assert designed(robot, *words, "--check", "--rate", "0.5") == ExitCode.DONE
     assert len(json.loads(capsys.readouterr().out)["null"]) == 10
     assert designed(robot, *words, "--seconds", "0.05", "--effort", "2") == ExitCode.DONE
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--out", "motion.png"],
+        ["--out", "motion.csv", "--ros", "./motion.csv"],
+        ["--out", "robot.xml"],
+        ["--ros", "limits.yaml"],
+    ],
+)
+def test_no_file_is_written_twice_or_over_one_that_is_read(
+    robot: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(robot.parent)
+    before = {one: one.read_bytes() for one in robot.parent.iterdir()}
+    assert designed(robot, "--unknown", "damping", *words) == ExitCode.BAD_REQUEST
+    assert "have a name twice" in capsys.readouterr().err
+    assert {one: one.read_bytes() for one in robot.parent.iterdir()} == before
