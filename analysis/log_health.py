@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from dopt.log import TURN, Log, Piece
+from dopt.log import Log, Piece
+from dopt.log_columns import TURN
 from dopt.types import Array, Booleans, Vector
 
 LAGS = np.arange(-3, 9)

@@ -23,7 +23,8 @@ from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
-from dopt.log import TURN, UNIT_OF_ANGLE, Log, clock_unit, count_text
+from dopt.log import Log
+from dopt.log_columns import TURN, UNIT_OF_ANGLE, clock_unit, count_text
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store

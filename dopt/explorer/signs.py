@@ -27,7 +27,7 @@ import numpy as np
 from dopt.control.planning import predict, relative_error
 from dopt.explorer.journal import Event
 from dopt.learning import SimulationError
-from dopt.log import count_text
+from dopt.log_columns import count_text
 from dopt.models.gaussian_process import GaussianProcess
 from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec

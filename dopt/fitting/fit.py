@@ -50,7 +50,8 @@ from dopt.fitting.problem import (
     windows_of,
 )
 from dopt.fitting.simulation import Data
-from dopt.log import Log, count_text
+from dopt.log import Log
+from dopt.log_columns import count_text
 from dopt.systems.plant import Plant, Unknown, first_guess
 from dopt.types import Array, Integers
 

@@ -33,7 +33,8 @@ from dopt.fitting.problem import (
     prediction_rows,
 )
 from dopt.fitting.simulation import Data
-from dopt.log import Log, count_text
+from dopt.log import Log
+from dopt.log_columns import count_text
 from dopt.systems.plant import Plant, Unknown
 from dopt.types import Array, Integers
 

@@ -301,7 +301,9 @@ class Plant:
                 raise _unlike(f"constants['{name}']", value, "a finite number or dopt.unknown()")
         for name, noise in self.measured.items():
             if isinstance(noise, Encoder) and name not in self.angles:
-                raise _unlike(f"measured['{name}']", noise, "an encoder of one of the angles")
+                raise _unlike(
+                    f"measured['{name}']", noise, "an encoder of a state named in angles="
+                )
         for what in _TIMES:
             given = getattr(self, what)
             first = given.value if isinstance(given, Unknown) else given

@@ -19,7 +19,7 @@ from analysis.serve.app import create_app
 from dopt import Explorer, encoder
 from dopt.control import planning
 from dopt.explorer.signs import SIGNS
-from dopt.log import count_text
+from dopt.log_columns import count_text
 from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.types import Array
