@@ -99,7 +99,8 @@ def in_scaled_numbers(spec: TrialSpec, *, damped: bool = True) -> TrialSpec:
     """Return the specification of a new exploration.
 
     An exploration of a plant works with scaled numbers, unless the user wrote the class of a
-    policy, model or learner: it is given the numbers of the plant. ``damped`` says whether fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
+    policy, model or learner: it is given the numbers of the plant. ``damped`` says whether
+    fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
     """
     parts = ((spec.policy, POLICIES), (spec.model, MODELS), (spec.learner, LEARNERS))
     shipped = all(type(part) in [*registry.values()] for part, registry in parts)

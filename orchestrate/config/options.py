@@ -96,7 +96,7 @@ class Axis:
 
     @property
     def replaces(self) -> bool:
-        """Return whether the override sets an existing key: no group, and without ``+`` or ``~``."""
+        """Return whether the override sets an existing key: no group, and no ``+`` or ``~``."""
         return self.kind != "choice" and self.key[0] not in "+~"
 
     def argument(self, index: int) -> str:
