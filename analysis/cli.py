@@ -161,10 +161,7 @@ def parser() -> Parser:
 
 
 def _command(
-    commands: argparse._SubParsersAction[Parser],
-    name: str,
-    run: object,
-    help_text: str,
+    commands: argparse._SubParsersAction[Parser], name: str, run: object, help_text: str
 ) -> Parser:
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run)

@@ -102,22 +102,22 @@ class Effect:
 
     @property
     def follows_state(self) -> bool:
-        """Whether the input is a function of the state."""
+        """Return whether the input is a function of the state."""
         return self.open < FOLLOWS
 
     @property
     def has_effect(self) -> bool:
-        """Whether an effect on the motion is told apart."""
+        """Return whether an effect on the motion is told apart."""
         return not self.follows_state and self.steadiness >= STEADY
 
     @property
     def explains_nothing(self) -> bool:
-        """Whether it follows the state, or varies on its own without an effect on the motion."""
+        """Return whether it follows the state, or varies alone without an effect on the motion."""
         return self.follows_state or (self.open > OWN and not self.has_effect)
 
     @property
     def closed_loop(self) -> bool:
-        """Whether the input answers to the measurements."""
+        """Return whether the input answers to the measurements."""
         is_large = self.feedback * (1.0 - self.predicted) > OF_INPUT
         feedback = self.feedback > (FEEDBACK if is_large else BETWEEN)
         most = ROUNDED if self.feedback > SURE else PREDICTED

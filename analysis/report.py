@@ -144,11 +144,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
     if gaps:
         notes.insert(0, outputs.partial_warning(gaps))
     text = write_report(
-        table,
-        notes,
-        _origin(facts, controlled=controlled is not None),
-        pictures,
-        controlled,
+        table, notes, _origin(facts, controlled=controlled is not None), pictures, controlled
     )
     outputs.write_text(text, options.out / outputs.PAGE)
     outputs.write_provenance(facts, options.out, NAME)
@@ -286,10 +282,7 @@ EFFORT: Columns = (
     ("steps to ε (share)", _steps),
     ("adjusted p", text_of("steps_p_adjusted", p_text)),
     ("coverage", mean_text("coverage")),
-    (
-        "control cost, ratio",
-        lambda row: but_lost(ratio_text("control_")(row), row["control_lost"]),
-    ),
+    ("control cost, ratio", lambda row: but_lost(ratio_text("control_")(row), row["control_lost"])),
     ("plan [µs]", text_of("plan_us", number)),
     ("learn [µs]", text_of("learn_us", number)),
     ("runs on", itemgetter("path")),

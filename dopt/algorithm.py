@@ -1,4 +1,4 @@
-"""Codes, tolerances and rules that the compiled kernel and the torch reference share."""
+"""Codes and tolerances that several modules share, most of them of the compiled kernel."""
 
 from __future__ import annotations
 
@@ -59,30 +59,8 @@ RUNGE_KUTTA_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 TIE_MARGIN = 1e-9
 """Values that differ by less than this relative margin are equal: rounding must not choose."""
 
-NEWEST_ERRORS = 25
-"""Samples over which limits take the exponential mean of the model's squared error."""
-
-INVARIANT = 1e-9
-"""A Krylov direction shorter than this beside its origin is rounding: the space is invariant."""
-
-
 SMALLEST_SHARE = 1.0 / 64.0
 """Smallest share of a Gauss-Newton step that is tried."""
 
-DAMPINGS = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
-"""Dampings that are tried, in units of the largest entry of the diagonal, where all shares fail."""
-
 NO_GROWTH = 1.0 + 1e-10
 """Growth of a sum of squares that counts as none: at its minimum rounding must not decide."""
-
-NOISE_FACTORS = (10.0**0.25, 10.0**-0.25)
-"""Factors by which a fit moves the variance of the accelerations as long as that is likelier."""
-
-MOST_NOISE_FACTORS = 8
-"""Moves of one fit by each factor, two decades in all."""
-
-DOMAIN_MARGIN = 0.25
-"""Half-widths beyond the box at which a row of a state counts e^(-1/2) times."""
-
-SPREAD_KEPT = 0.1
-"""Share of the mean and the spread of one iteration of the cross-entropy method in the next."""

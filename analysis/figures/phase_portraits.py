@@ -207,10 +207,7 @@ def _panel(axes: Axes, portrait: Portrait, plane: DrawnPlane) -> None:
     axes.plot(*portrait.start, marker="o", ms=4, mfc="white", mec=BLACK, mew=1, zorder=3)
     n = but_diverged(portrait.n, portrait.n_diverged)
     covered = percent_text(portrait.coverage, portrait.coverage_error, portrait.n)
-    axes.set_title(
-        f"{style.label}\ncoverage {covered or 'unknown'} (n = {n})",
-        fontsize=7.5,
-    )
+    axes.set_title(f"{style.label}\ncoverage {covered or 'unknown'} (n = {n})", fontsize=7.5)
     if not len(portrait.line):
         axes.text(0.5, 0.5, "no finished trial", transform=axes.transAxes, ha="center")
     elif portrait.diverged:

@@ -96,12 +96,7 @@ def mean_over_steps(values: Array) -> Array:
     return found
 
 
-def _scores(
-    reader: Reader,
-    entry: Entry,
-    column: str,
-    score: Callable[[Array], Array],
-) -> BySeed:
+def _scores(reader: Reader, entry: Entry, column: str, score: Callable[[Array], Array]) -> BySeed:
     sample = read_sample(reader, entry, column)
     return dict(zip(sample.seeds.tolist(), score(sample.values).tolist(), strict=True))
 

@@ -70,10 +70,7 @@ def paired(own: BySeed, reference: BySeed) -> tuple[Array, Array]:
 
 
 def compare_policies(
-    reader: Reader,
-    selection: Selection,
-    column: str = "loss",
-    measure: Measure = Measure.FINAL,
+    reader: Reader, selection: Selection, column: str = "loss", measure: Measure = Measure.FINAL
 ) -> pd.DataFrame:
     """Return the ratio of losses, one row for each environment and variant.
 
@@ -93,10 +90,7 @@ def compare_policies(
 
 
 def compare_steps(
-    reader: Reader,
-    selection: Selection,
-    column: str = "loss",
-    epsilon: float | None = None,
+    reader: Reader, selection: Selection, column: str = "loss", epsilon: float | None = None
 ) -> pd.DataFrame:
     """Return who reaches the loss ε first, one row for each environment and variant.
 

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from dopt.kernel.learners import Problem
 
     FitRequest = tuple[Plant, Log, int, int] | Request | tuple[Samples | Problem, Array]
-    """Request of a fit: plant, log, units of the network, seed; samples of processes, or samples
-    with the numbers that they are to have; or a network with its samples, and its first parameters.
-    """
+    """Request of a fit: plant, log, units of the network, seed; samples of processes, or these
+    with the numbers that they are to have; or a network with its samples, and the parameters to
+    begin with."""
 
 
 class Recording:

@@ -46,14 +46,7 @@ from dopt.fitting.fit import (
 )
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Model, data_of, measured_names
-from dopt.fitting.problem import (
-    Simulator,
-    Windows,
-    first_states,
-    left_over,
-    solve,
-    windows_of,
-)
+from dopt.fitting.problem import Simulator, Windows, first_states, left_over, solve, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log, Piece
 from dopt.systems.plant import Plant, first_guess

@@ -212,8 +212,8 @@ _BY_MODEL = {"model": "rms", "physics alone": "physics", "linear": "linear"}
 class FittedTrial(MarkedTrial):
     """A fit as a trial, by its plant, its logs and what was tried.
 
-    A fit of the same plant to the same logs in the same way has the same key. Its seed is the
-    seed of its network, 0 without one.
+    A fit of the same plant to the same logs in the same way has the same key. Its seed is its
+    network's, 0 without one.
 
     Attributes
     ----------

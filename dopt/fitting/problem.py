@@ -28,15 +28,7 @@ from scipy.linalg import blas, cho_factor, cho_solve
 
 from dopt.fitting import simulation
 from dopt.fitting.model import Model, measured_names
-from dopt.fitting.simulation import (
-    DERIVATIVES,
-    Data,
-    Problem,
-    Projected,
-    Structure,
-    Values,
-    Work,
-)
+from dopt.fitting.simulation import DERIVATIVES, Data, Problem, Projected, Structure, Values, Work
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
@@ -521,13 +513,7 @@ def predicted(simulator: Simulator, p: Array, rows: Integers) -> Predicted:
 
 
 def prediction_rows(
-    data: Data,
-    rows: tuple[int, int],
-    history: float,
-    horizon: float,
-    *,
-    skip: float,
-    ahead: float,
+    data: Data, rows: tuple[int, int], history: float, horizon: float, *, skip: float, ahead: float
 ) -> Integers:
     """Return windows within first and last rows, (k, 3), as :func:`predicted` takes them.
 

@@ -344,12 +344,7 @@ def _held(
 
 @_inlined
 def _integrate(
-    structure: Structure,
-    values: Values,
-    work: Work,
-    u: Vector,
-    seconds: float,
-    sensitive: bool,
+    structure: Structure, values: Values, work: Work, u: Vector, seconds: float, sensitive: bool
 ) -> None:
     """Move x and S, and what acts of u with its derivatives, by a time during which u is held."""
     d = work.x.shape[0]
@@ -374,12 +369,7 @@ def _integrate(
 
 @_inlined
 def _switched(
-    structure: Structure,
-    values: Values,
-    work: Work,
-    before: Vector,
-    after: Vector,
-    sensitive: bool,
+    structure: Structure, values: Values, work: Work, before: Vector, after: Vector, sensitive: bool
 ) -> None:
     """Take in that the input has switched: the derivatives by the delay change."""
     if not structure.free_delay:

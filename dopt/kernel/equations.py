@@ -177,11 +177,7 @@ def _known_into(
     function: Equation, n_states: int, n_inputs: int, n_parameters: int
 ) -> CompiledFunction:
     def into(x: Array, u: Array, p: Array, out: Array) -> None:
-        values = function(
-            as_tuple(x, n_states),
-            as_tuple(u, n_inputs),
-            as_tuple(p, n_parameters),
-        )
+        values = function(as_tuple(x, n_states), as_tuple(u, n_inputs), as_tuple(p, n_parameters))
         for i in range(len(values)):
             out[i] = values[i]
 

@@ -11,12 +11,7 @@ from dopt.algorithm import RUNGE_KUTTA_SHARES, RUNGE_KUTTA_WEIGHTS, Integrator
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python, compiled, copy_into
 from dopt.kernel.held import HeldTrial, trial_in
-from dopt.kernel.model import (
-    model_accelerations,
-    model_point,
-    plant_point,
-    sampled_state,
-)
+from dopt.kernel.model import model_accelerations, model_point, plant_point, sampled_state
 from dopt.kernel.structs import Network, Plant, Trial
 from dopt.types import Matrix, Stack, Vector
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import MOST_NOISE_FACTORS, NO_GROWTH, NOISE_FACTORS, SMALLEST_SHARE
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import next_model_state
 from dopt.kernel.learners import filter_step, sampled_point, squared_distance
@@ -32,6 +32,12 @@ from dopt.kernel.sensors import (
 from dopt.kernel.structs import Trial
 from dopt.kernel.vectors import add_symmetric, inner, multiply
 from dopt.types import Matrix, Vector
+
+NOISE_FACTORS = (10.0**0.25, 10.0**-0.25)
+"""Factors by which a fit moves the variance of the accelerations as long as that is likelier."""
+
+MOST_NOISE_FACTORS = 8
+"""Moves of one fit by each factor, two decades in all."""
 
 
 @compiled

@@ -37,7 +37,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import DAMPINGS, NO_GROWTH, SMALLEST_SHARE, ModelKind
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE, ModelKind
 from dopt.kernel.compiler import called_from_python, compiled, copy_into, squared
 from dopt.kernel.gaussian_process import add_sample
 from dopt.kernel.linear_algebra import (
@@ -63,6 +63,9 @@ from dopt.kernel.normal_equations import (
 from dopt.kernel.structs import Covariance, Network, State, Trial
 from dopt.kernel.vectors import LANES, add_multiple, inner, multiply_add
 from dopt.types import Matrix, Vector
+
+DAMPINGS = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
+"""Dampings that are tried, in units of the largest entry of the diagonal, where all shares fail."""
 
 
 @compiled

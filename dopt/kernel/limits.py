@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
+from dopt.algorithm import TIE_MARGIN
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import add_stage, n_stages, predicted_state, write_rate
 from dopt.kernel.joint_kalman import acceleration_variances, state_variances
@@ -19,6 +19,9 @@ from dopt.kernel.model import model_accelerations, model_point
 from dopt.kernel.sensors import has_sensors
 from dopt.kernel.structs import Limits, Trial
 from dopt.types import Matrix, Vector
+
+NEWEST_ERRORS = 25
+"""Samples over which limits take the exponential mean of the model's squared error."""
 
 
 @compiled

@@ -13,22 +13,12 @@ import numpy as np
 
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import called_from_python, compiled, copy_into, monotonic_microseconds
-from dopt.kernel.evaluation import (
-    Buffers,
-    evaluation_buffers,
-    follow_truth,
-    model_error,
-)
+from dopt.kernel.evaluation import Buffers, evaluation_buffers, follow_truth, model_error
 from dopt.kernel.gaussian_process import add_to_points
 from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.integration import input_columns, next_model_state, next_true_state
 from dopt.kernel.learners import sampled_point
-from dopt.kernel.model import (
-    model_accelerations,
-    rows_at,
-    within,
-    write_gradients,
-)
+from dopt.kernel.model import model_accelerations, rows_at, within, write_gradients
 from dopt.kernel.sensors import has_sensors, measure, output_error
 from dopt.kernel.structs import Evaluation, Learn, Plant, State, Steps, Trial
 from dopt.types import Matrix, Stack, Vector

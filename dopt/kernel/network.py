@@ -493,11 +493,7 @@ def output_signal_along(
 
 @compiled
 def signals_below(
-    network: Network,
-    theta: Vector,
-    hidden: Matrix,
-    hidden_dots: Stack,
-    signals: Stack,
+    network: Network, theta: Vector, hidden: Matrix, hidden_dots: Stack, signals: Stack
 ) -> None:
     """Write δ and its derivatives along m directions, (1 + m, L, w), given the last layer's."""
     for index in range(hidden.shape[0] - 1, 0, -1):

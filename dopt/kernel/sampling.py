@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, ModelKind, Score
+from dopt.algorithm import TIE_MARGIN, ModelKind, Score
 from dopt.kernel import gaussian_process as gp
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, squared
@@ -40,6 +40,12 @@ from dopt.kernel.vectors import (
     subtract_product,
 )
 from dopt.types import Matrix, Stack, Vector
+
+DOMAIN_MARGIN = 0.25
+"""Half-widths beyond the box at which a row of a state counts e^(-1/2) times."""
+
+SPREAD_KEPT = 0.1
+"""Share of the mean and the spread of one iteration of the cross-entropy method in the next."""
 
 
 class Directions(NamedTuple):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import INVARIANT, TIE_MARGIN, ModelKind, Score
+from dopt.algorithm import TIE_MARGIN, ModelKind, Score
 from dopt.kernel import gaussian_process as gp
 from dopt.kernel.compiler import compiled, monotonic_microseconds, squared
 from dopt.kernel.integration import write_rate
@@ -26,6 +26,9 @@ from dopt.kernel.network import multiply_vector
 from dopt.kernel.structs import Covariance, Network, Plant, Search, State, Trial
 from dopt.kernel.vectors import add_multiple, inner, multiply, product
 from dopt.types import Booleans, Integers, Matrix, Stack, Vector
+
+INVARIANT = 1e-9
+"""A Krylov direction shorter than this beside its origin is rounding: the space is invariant."""
 
 
 @compiled

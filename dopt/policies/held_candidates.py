@@ -16,13 +16,7 @@ import numpy as np
 from dopt.fields import parameter
 from dopt.learning import Adam, AdamWindow
 from dopt.models import MLP
-from dopt.policies.base import (
-    Array,
-    CustomPolicy,
-    Planner,
-    check_ensemble,
-    check_length,
-)
+from dopt.policies.base import Array, CustomPolicy, Planner, check_ensemble, check_length
 from dopt.policies.search import CandidatePolicy
 from dopt.systems.base import System, next_state
 from dopt.trial_view import TrialView

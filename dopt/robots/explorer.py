@@ -570,10 +570,7 @@ class RobotExplorer:
         joints: dict[str, dict[str, Any]] = {
             name: {
                 "coulomb": (float(values[j, -2]), float(half[j, -2])),
-                "viscous": (
-                    float(values[j, -1] / velocity[j]),
-                    float(half[j, -1] / velocity[j]),
-                ),
+                "viscous": (float(values[j, -1] / velocity[j]), float(half[j, -1] / velocity[j])),
                 "relative_width": float(widths[j]),
                 "noise": float(learner.noise[j] * unit[j]),
             }

@@ -20,11 +20,7 @@ from dopt.robots.body import Body, Motion, inertial
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
-OF_BODIES = {
-    "mass": ("mass",),
-    "com": ("com_x", "com_y", "com_z"),
-    "inertia": ("Ix", "Iy", "Iz"),
-}
+OF_BODIES = {"mass": ("mass",), "com": ("com_x", "com_y", "com_z"), "inertia": ("Ix", "Iy", "Iz")}
 """Kinds of parameters of a body, and the parameters that each stands for.
 
 Centres are in the body's frame, inertias are principal moments about the centre.

@@ -98,9 +98,9 @@ def scaled(system: System) -> Scaled:
 def in_scaled_numbers(spec: TrialSpec, *, damped: bool = True) -> TrialSpec:
     """Return the specification of a new exploration.
 
-    An exploration of a plant works with scaled numbers, unless a policy, model or learner is a
-    class of the user, which is given the numbers of the plant that it was written for. ``damped``
-    says whether fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
+    An exploration of a plant works with scaled numbers, unless the user wrote the class of a
+    policy, model or learner: it is given the numbers of the plant. ``damped`` says whether
+    fits damp steps that overshoot (:class:`dopt.learning.GaussNewton`).
     """
     parts = ((spec.policy, POLICIES), (spec.model, MODELS), (spec.learner, LEARNERS))
     shipped = all(type(part) in [*registry.values()] for part, registry in parts)
@@ -138,10 +138,7 @@ def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
 
 
 def learned_accelerations(
-    spec: TrialSpec,
-    parameters: Array,
-    states: npt.ArrayLike,
-    inputs: npt.ArrayLike | None = None,
+    spec: TrialSpec, parameters: Array, states: npt.ArrayLike, inputs: npt.ArrayLike | None = None
 ) -> Array:
     """Return the accelerations, (N, r), that a model has learned, in the units of the system.
 

@@ -83,10 +83,7 @@ class TrialSpec(Validated):
 
     @classmethod
     def _of_parts(
-        cls,
-        system: System,
-        sections: Mapping[str, Part],
-        given: Mapping[str, object],
+        cls, system: System, sections: Mapping[str, Part], given: Mapping[str, object]
     ) -> TrialSpec:
         policy = build("policy", POLICIES, sections["policy"])
         model = _model(sections["model"])

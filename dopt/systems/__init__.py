@@ -10,12 +10,7 @@ from dopt.systems.arm import Arm, Chain
 from dopt.systems.base import Feature, System
 from dopt.systems.black_box import BlackBox
 from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
-from dopt.systems.mujoco import (
-    MuJoCoAcrobot,
-    MuJoCoCartpole,
-    MuJoCoPendulum,
-    MuJoCoReacher,
-)
+from dopt.systems.mujoco import MuJoCoAcrobot, MuJoCoCartpole, MuJoCoPendulum, MuJoCoReacher
 from dopt.systems.oscillators import MassSpring, VanDerPol
 from dopt.systems.pendulum import (
     CoupledPendulums,

@@ -408,12 +408,7 @@ def _class(
         for name in ("wrapped", "hardware")
     ]
     return dataclasses.make_dataclass(
-        kind.__name__,
-        fields,
-        bases=(_Behind, kind),
-        namespace=namespace,
-        frozen=True,
-        kw_only=True,
+        kind.__name__, fields, bases=(_Behind, kind), namespace=namespace, frozen=True, kw_only=True
     )
 
 

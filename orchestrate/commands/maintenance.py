@@ -108,9 +108,7 @@ def _doctor_lines(findings: list[Finding]) -> list[str]:
 
 
 DOCTOR_COMMAND = Command(
-    "doctor",
-    "check for damage, incomplete results, wrong keys and stale claims",
-    _run_doctor,
+    "doctor", "check for damage, incomplete results, wrong keys and stale claims", _run_doctor
 )
 
 

@@ -19,15 +19,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from orchestrate.commands import (
-    Command,
-    add_filters,
-    chosen,
-    plain,
-    say_json,
-    show,
-    table,
-)
+from orchestrate.commands import Command, add_filters, chosen, plain, say_json, show, table
 from orchestrate.errors import ExitCode
 from orchestrate.program import UsageError, integer, positive, tell
 from orchestrate.store import (

@@ -12,15 +12,7 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
-from orchestrate.commands import (
-    Command,
-    add_filters,
-    chosen,
-    plain,
-    say,
-    say_json,
-    show,
-)
+from orchestrate.commands import Command, add_filters, chosen, plain, say, say_json, show
 from orchestrate.commands.results import STATES, Status, gather, grid_table, seconds_since
 from orchestrate.errors import ExitCode, without_password
 from orchestrate.program import as_started, length_of_time, positive, tell

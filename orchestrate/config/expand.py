@@ -342,7 +342,7 @@ class _ScalarOverrides:
 
     @property
     def applicable(self) -> bool:
-        """Whether every key holds an untyped scalar, so that it accepts any value."""
+        """Return whether every key holds an untyped scalar, so that it accepts any value."""
         return all(type(_node(self._config, key)) is AnyNode for key in self._keys)
 
     def free(self, key: str) -> bool:

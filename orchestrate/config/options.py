@@ -96,7 +96,7 @@ class Axis:
 
     @property
     def replaces(self) -> bool:
-        """Whether the override sets an existing key: not a group, and without ``+`` or ``~``."""
+        """Return whether the override sets an existing key: no group, and no ``+`` or ``~``."""
         return self.kind != "choice" and self.key[0] not in "+~"
 
     def argument(self, index: int) -> str:
@@ -151,11 +151,7 @@ def parsed_overrides(
 
 
 def _sorted(
-    sort: Callable[..., Any],
-    *args: Any,
-    sweep: Any = None,
-    reverse: bool = False,
-    **named: Any,
+    sort: Callable[..., Any], *args: Any, sweep: Any = None, reverse: bool = False, **named: Any
 ) -> Any:
     """Sort as Hydra's ``sort``, except for a range, which Hydra turns into another range."""
     ranges = [one for one in (*args, sweep) if isinstance(one, RangeSweep)]

@@ -253,7 +253,7 @@ class Scheduler:
 
     @property
     def ending(self) -> bool:
-        """Whether no further trial starts."""
+        """Return whether no further trial starts."""
         return self.stop.stop_requested or (self.fail_fast and bool(self.failures))
 
     def _fill(self) -> None:

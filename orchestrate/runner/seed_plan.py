@@ -95,7 +95,7 @@ class SeedPlan:
 
     @property
     def adaptive(self) -> bool:
-        """Whether the results decide how many seeds are run."""
+        """Return whether the results decide how many seeds are run."""
         return self._relative is not None
 
     def stages(self, final_losses: FinalLosses) -> Iterator[tuple[str, Grid]]:

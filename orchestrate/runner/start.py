@@ -215,13 +215,7 @@ class _GridRun:
             start = time.monotonic()
             chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
             scheduler = Scheduler(
-                self.store,
-                executor,
-                chunks,
-                tally,
-                stop,
-                settings.fail_fast,
-                settings.retry_memory,
+                self.store, executor, chunks, tally, stop, settings.fail_fast, settings.retry_memory
             )
             for stage, state in stages:
                 chunks.add(_waiting(stage, state))

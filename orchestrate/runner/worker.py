@@ -65,7 +65,7 @@ class Leave:
 
     @property
     def at_once(self) -> bool:
-        """Whether running trials are handed back now."""
+        """Return whether running trials are handed back now."""
         now = time.monotonic()
         if self._interrupt.stop_requested:
             self._asked = min(self._asked, now)

@@ -237,11 +237,7 @@ class Target:
     """Transaction of a merge."""
 
     def __init__(
-        self,
-        connection: Connection,
-        backend: Backend,
-        source: Source,
-        launches: Mapping[int, int],
+        self, connection: Connection, backend: Backend, source: Source, launches: Mapping[int, int]
     ) -> None:
         self._connection = connection
         self._backend = backend

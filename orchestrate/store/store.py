@@ -29,14 +29,7 @@ from orchestrate.errors import InvalidResultError, StoreError, without_password
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store import records, schema
 from orchestrate.store.backend import Backend, parse_url
-from orchestrate.store.launches import (
-    GridRows,
-    Launches,
-    begin_attempts,
-    living,
-    register,
-    renew,
-)
+from orchestrate.store.launches import GridRows, Launches, begin_attempts, living, register, renew
 from orchestrate.store.postgresql import PostgreSQLBackend
 from orchestrate.store.records import (
     DTYPE,

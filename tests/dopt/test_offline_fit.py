@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
 from dopt.assessment import parameter_error, true_parameters
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, random_transitions
@@ -266,10 +265,11 @@ def test_the_information_after_a_fit_is_in_the_derivatives_of_the_innovations() 
 def test_a_fitted_noise_is_the_likeliest_of_its_neighbours() -> None:
     fast = after_fit(60, noise="fitted", noise_variance=3.0)
     fitted, theta = float(fast.state.estimate.noise_variance[0]), fast.state.theta.copy()
-    moves = abs(math.log10(fitted / 3.0)) / math.log10(NOISE_FACTORS[0])
-    assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
+    moves = abs(math.log10(fitted / 3.0)) / math.log10(joint_kalman.NOISE_FACTORS[0])
+    assert 0.5 < moves < joint_kalman.MOST_NOISE_FACTORS - 0.5
     lowest, *others = (
-        innovations(fast, theta, factor * fitted).unlikelihood for factor in (1.0, *NOISE_FACTORS)
+        innovations(fast, theta, factor * fitted).unlikelihood
+        for factor in (1.0, *joint_kalman.NOISE_FACTORS)
     )
     assert lowest <= min(others)
 

@@ -99,10 +99,7 @@ _STDERR = 2  # Ray writes it to a log file of the worker on its node
 
 
 def run_chunk(
-    run: Run,
-    tasks: list[Task],
-    limits: Limits,
-    prepare: Prepare | None = None,
+    run: Run, tasks: list[Task], limits: Limits, prepare: Prepare | None = None
 ) -> Iterator[TaskDone | None]:
     """Run tasks in order; yield None when the first begins, then each outcome as it ends.
 
