@@ -87,13 +87,13 @@ def make(executor: str) -> Iterator[Make]:
         one.stop()
 
 
-def new(name: str, run: Run) -> Executor:
+def new(name: str, run: Run, **given: Any) -> Executor:
     if name == "inprocess":
         return InProcessExecutor(run)
     if name == "local":
-        return LocalExecutor(run, workers=WORKERS)
+        return LocalExecutor(run, **{"workers": WORKERS, **given})
     ray = importlib.import_module("orchestrate.executors.ray.executor")
-    return ray.RayExecutor(run, workers=WORKERS)  # type: ignore[no-any-return]
+    return ray.RayExecutor(run, **{"workers": WORKERS, **given})  # type: ignore[no-any-return]
 
 
 @for_all
