@@ -280,10 +280,8 @@ def test_the_values_are_grouped_and_compared(stored: Reader) -> None:
 
 def test_the_usual_value_stands_for_the_policy(stored: Reader) -> None:
     entries = select(stored, Filter()).entries
-    assert [entry.config.config["policy"].get("information") for entry in entries] == [
-        "accumulated",
-        None,
-    ]
+    found = [entry.config.config["policy"].get("information") for entry in entries]
+    assert found == ["accumulated", None]
     assert [entry.label for entry in entries] == ["D-optimal", "random"]
     old, new = sorted(stored.configs(), key=lambda one: "fresh" in one.label)[0::2]
     assert usual_values(old.config)[PATH] == "accumulated"

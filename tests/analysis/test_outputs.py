@@ -118,10 +118,8 @@ def test_a_long_title_is_broken_between_counts() -> None:
     counts = "(n = 4; D-optimal: 3/4, 1 diverged; random: 0/4, 4 diverged)"
     lines = _title("arm", counts).split("\n")
     assert lines[0] == "arm"
-    assert [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines[1:]] == [
-        "(n = 4; D-optimal: 3/4, 1 diverged;",
-        "random: 0/4, 4 diverged)",
-    ]
+    found = [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines[1:]]
+    assert found == ["(n = 4; D-optimal: 3/4, 1 diverged;", "random: 0/4, 4 diverged)"]
 
 
 def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:

@@ -282,10 +282,8 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
     assert command_line(*one, "executor=lockstep")[0] == 0
     assert command_line(*one, "executor=inprocess")[0] == 0
     with Reader.open(url) as reader:
-        assert sorted(str(config.config["path"]) for config in reader.configs()) == [
-            "kernel",
-            "reference",
-        ]
+        found = sorted(str(config.config["path"]) for config in reader.configs())
+        assert found == ["kernel", "reference"]
 
 
 LAUNCH = """

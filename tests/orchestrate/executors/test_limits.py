@@ -166,11 +166,8 @@ def test_a_trial_with_too_little_memory_gets_more_once(launches: Launches, execu
     assert (cause, attempt) == ("out of memory", 2)
     assert launches(wants_a_gigabyte, **settings, retry_memory=4.0, retry="failed") == ExitCode.DONE
     ends = "SELECT attempt, outcome, cause FROM attempt WHERE attempt > 1 ORDER BY attempt"
-    assert launches.query(ends) == [
-        (2, "failed", "out of memory"),
-        (3, "released", "out of memory"),
-        (4, "done", None),
-    ]
+    expected = [(2, "failed", "out of memory"), (3, "released", "out of memory"), (4, "done", None)]
+    assert launches.query(ends) == expected
 
 
 @pytest.fixture
