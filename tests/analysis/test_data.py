@@ -88,11 +88,9 @@ def test_one_configuration_of_each_policy_is_shown(results: analysis.Results) ->
     assert set(shown.index) < set(results.configurations().index)
 
 
-def test_what_is_not_there_is_a_sentence(results: analysis.Results, url: str) -> None:
+def test_what_is_not_there_is_a_sentence(results: analysis.Results) -> None:
     with pytest.raises(AnalysisError, match="stored are"):
         results.matrix("arm", "random")
-    with pytest.raises(AnalysisError, match="fits no stored configuration"):
-        analysis.load(url, where={"model.width": 5}).trials()
     with pytest.raises(NoDatabaseError):
         analysis.load("sqlite:///nowhere/results.db")
 
