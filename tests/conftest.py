@@ -114,7 +114,11 @@ def server(server_url: str) -> Iterator[Engine]:
     try:
         engine.connect().close()
     except OperationalError as error:
-        _no_server(str(error.orig).splitlines()[0])
+        reason = str(error.orig).splitlines()[0]
+        message = f"no PostgreSQL server answers, set DOPT_TEST_POSTGRES to one: {reason}"
+        if os.environ.get("DOPT_REQUIRE_POSTGRES") == "1":
+            pytest.fail(message)
+        pytest.skip(message)
     yield engine
     engine.dispose()
 
@@ -126,13 +130,6 @@ def postgresql_url(request: pytest.FixtureRequest) -> Iterator[str]:
 
     with new_schema(request) as url:
         yield url
-
-
-def _no_server(reason: str) -> None:
-    message = f"no PostgreSQL server answers, set DOPT_TEST_POSTGRES to one: {reason}"
-    if os.environ.get("DOPT_REQUIRE_POSTGRES") == "1":
-        pytest.fail(message)
-    pytest.skip(message)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -75,16 +75,13 @@ def test_every_target_of_make_exists() -> None:
     assert {"figures", "test"} <= named <= set(targets)
 
 
-def _once(found: list[Command]) -> list[Command]:
-    """Return each command once, although several pages show it."""
-    return list({(*c.variables.items(), *c.words): c for c in found}.values())
+ACCEPTED = {
+    (*c.variables.items(), *c.words): c for c in commands("launch.py") if c.page != TUTORIAL
+}
+"""Commands of launches outside the tutorial, each once: that is run from its first to its last."""
 
 
-ACCEPTED = [command for command in _once(commands("launch.py")) if command.page != TUTORIAL]
-"""Commands of launches outside the tutorial, which is run from its first to its last."""
-
-
-@pytest.mark.parametrize("command", ACCEPTED, ids=str)
+@pytest.mark.parametrize("command", ACCEPTED.values(), ids=str)
 def test_every_launch_command_is_accepted(
     command: Command,
     tmp_path: Path,

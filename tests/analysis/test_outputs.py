@@ -7,7 +7,6 @@ import io
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -23,29 +22,22 @@ from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, limited
 from tests.analysis.synthetic import fill, make_grid
+from tests.orchestrate.runner.test_records import commit, git
 from tests.paths import ROOT
 
 
-def test_the_commit_belongs_to_the_code_and_not_to_a_folder_around_it(
+def test_the_state_of_the_code_is_that_of_its_own_repository(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Such as the repository that holds the virtual environment of an installed copy."""
-    package = tmp_path / "venv" / "analysis"
-    package.mkdir(parents=True)
-    git = ("git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b")
-    subprocess.run([*git, "init", "--quiet"], check=True)
-    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "x"], check=True)
-    monkeypatch.setattr(outputs, "PACKAGE", package)
-    state = outputs.git_state.__wrapped__
-    monkeypatch.delenv("DOPT_COMMIT", raising=False)
-    assert state() == {"commit": None, "dirty": None}
-    monkeypatch.setenv("DOPT_COMMIT", "abc")
-    assert state() == {"commit": "abc", "dirty": None}
     monkeypatch.setattr(outputs, "PACKAGE", tmp_path / "analysis")
-    (tmp_path / "analysis").mkdir()
-    found = state()
-    assert re.fullmatch(r"[0-9a-f]{40}", str(found["commit"]))
-    assert found["dirty"] is False
+    state = outputs.git_state.__wrapped__
+    for image in ("", "abc"):
+        monkeypatch.setenv("DOPT_COMMIT", image)
+        assert state() == {"commit": image or None, "dirty": None}
+    commit(tmp_path, "code.py")
+    assert state() == {"commit": git(tmp_path, "rev-parse", "HEAD"), "dirty": False}
+    (tmp_path / "code.py").write_text("a = 2\n")
+    assert state()["dirty"] is True
 
 
 QUICK = ("figure2_spectrum", "comparison")
@@ -126,10 +118,8 @@ def test_a_long_title_is_broken_between_counts() -> None:
     counts = "(n = 4; D-optimal: 3/4, 1 diverged; random: 0/4, 4 diverged)"
     lines = _title("arm", counts).split("\n")
     assert lines[0] == "arm"
-    assert [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines[1:]] == [
-        "(n = 4; D-optimal: 3/4, 1 diverged;",
-        "random: 0/4, 4 diverged)",
-    ]
+    found = [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines[1:]]
+    assert found == ["(n = 4; D-optimal: 3/4, 1 diverged;", "random: 0/4, 4 diverged)"]
 
 
 def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:

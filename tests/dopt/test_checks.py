@@ -34,10 +34,6 @@ def of_the_product(state: Any, parameters: Any) -> tuple[Any, ...]:
     return (-parameters[1] * parameters[3] * state[1],)
 
 
-def by_the_sign(state: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG001  # one signature
-    return (1.0,) if state[1] > 0 else (-1.0,)
-
-
 def broken_system(**attributes: Any) -> System:
     """Return a pendulum of another class, with some of its attributes replaced."""
     functions = {
@@ -82,7 +78,8 @@ MISSPELT = ("mass", "lenth", "gravity", "friction")
         ("accelerations", lambda x, *_: -x[1], "one number, but a tuple of 1 is .* with its comma"),
         ("accelerations", lambda *_: None, r"accelerations\(\) .* fails .*TypeError"),
         ("accelerations", lambda x, *_: (math.sin(x[0]),), r"fails for arrays .*\.elementary"),
-        ("accelerations", by_the_sign, r"fails for arrays of 5 states \(ValueError"),
+        ("accelerations", lambda x, *_: (1.0,) if x[1] > 0 else (-1.0,),
+         r"fails for arrays of 5 states \(ValueError"),
         ("known", lambda *_: 0.0, r"known\(\) .* returns one number, but a tuple of 2 is expected"),
         ("known", lambda x, *_: (x[1],), "returns 1 numbers, .* of 2 .* for each state: correct"),
         ("known", known(lambda _, u: u[0] ** 2), "is not affine in the inputs"),

@@ -27,13 +27,10 @@ def size(Q: np.ndarray, v: np.ndarray, radius: float) -> float:
     return float(len(v) * (radius**2 * np.abs(Q).max() + radius * np.abs(v).max()))
 
 
-def rotation(m: int, seed: int) -> np.ndarray:
-    return np.linalg.qr(np.random.default_rng(seed).standard_normal((m, m)))[0]
-
-
 def from_eigenvalues(values: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a symmetric matrix with these eigenvalues, and its axes in columns."""
-    axes = rotation(len(values), seed)
+    drawn = np.random.default_rng(seed).standard_normal((len(values), len(values)))
+    axes = np.linalg.qr(drawn)[0]
     Q = axes @ np.diag(values) @ axes.T
     return 0.5 * (Q + Q.T), axes
 

@@ -55,10 +55,8 @@ def test_mlflow_reads_every_run(results: Path, tmp_path: Path) -> None:
     assert set(found) == set(RESULTS)
     for spec in SPECS:
         run, result = found[spec.trial_key], RESULTS[spec.trial_key]
-        assert (run.data.params["env.name"], run.data.params["seed"]) == (
-            spec.system.name,
-            str(spec.seed),
-        )
+        shown = (run.data.params["env.name"], run.data.params["seed"])
+        assert shown == (spec.system.name, str(spec.seed))
         assert run.data.tags["status"] == ("diverged" if spec.trial_key in LOST else "done")
         history = client.get_metric_history(run.info.run_id, "loss")
         assert [one.value for one in history] == losses(spec)

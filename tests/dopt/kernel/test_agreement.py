@@ -115,17 +115,12 @@ def learners_of(env: str, policy: str) -> list[dict[str, Any]]:
     return [NEWEST, WINDOW] if env in PAPER else [WINDOW]
 
 
-def runs_on_both(env: str, policy: str) -> bool:
-    """Return whether the torch path plans by a policy, and the model reads no inputs."""
-    planned = POLICIES[policy] in REFERENCE_POLICIES or issubclass(POLICIES[policy], OpenLoop)
-    return planned and not SYSTEMS[env].reads_inputs
-
-
 PAPER = ("pendulum", "cartpole", "arm", "quadrotor")
 PAIR_CASES = [
     pytest.param(env, policy, learner, id=f"{env}-{policy}-{learner.get('name', 'usual')}")
     for env, policy in PAIRS
-    if runs_on_both(env, policy)
+    if not SYSTEMS[env].reads_inputs  # which the model of the torch path does not
+    if POLICIES[policy] in REFERENCE_POLICIES or issubclass(POLICIES[policy], OpenLoop)
     for learner in learners_of(env, policy)
 ]
 

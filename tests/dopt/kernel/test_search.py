@@ -205,23 +205,13 @@ def test_no_input_on_the_sphere_gains_more(env: str, information_of: str) -> Non
         assert found >= max(scan) - 1e-3 * np.ptp(scan)
 
 
-def linear_trial(policy: str, seed: int = 0, **env: Any) -> TrialSpec:
-    return trial(
-        "mass_spring",
-        policy,
-        seed,
-        env=env,
-        policy={"regularization": 1e-3},
-        model={"name": "linear_state"},
-        learner={"name": "recursive_least_squares"},
-    )
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_the_d_optimal_policy_recovers_the_linear_one_exactly(seed: int) -> None:
     """Section 2: "we recover the D-optimal exploration algorithm of [7]"."""
+    parts = {"policy": {"regularization": 1e-3}, "model": {"name": "linear_state"}}
+    parts |= {"env": {"horizon": 80}, "learner": {"name": "recursive_least_squares"}}
     general, closed = (
-        run_trial(linear_trial(policy, seed, horizon=80)) for policy in ("d_optimal", "linear")
+        run_trial(trial("mass_spring", policy, seed, **parts)) for policy in ("d_optimal", "linear")
     )
     assert closed.inputs == pytest.approx(general.inputs, rel=0.0, abs=1e-7)
     assert closed.states == pytest.approx(general.states, rel=0.0, abs=1e-7)

@@ -245,10 +245,8 @@ def test_bytes_and_sums_are_json_too(ask: Run) -> None:
 def test_it_says_when_rows_are_cut(ask: Run) -> None:
     answer = ask("query", STEPS, "--limit", "2")
     assert len(answer.out.splitlines()) == 3
-    assert (
-        answer.err
-        == "note: only the first 2 rows are shown, --limit N gives more, --csv gives all.\n"
-    )
+    expected = "note: only the first 2 rows are shown, --limit N gives more, --csv gives all.\n"
+    assert answer.err == expected
     assert ask("query", STEPS, "--limit", "2", "--json").document["cut"] is True
 
 

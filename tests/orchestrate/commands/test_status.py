@@ -88,11 +88,6 @@ class TestOnce:
         both = command("status", "--json", "--env", "pendulum", "cartpole", "--policy", "random")
         assert both.document["trials"]["all"] == 6
 
-    def test_an_unknown_name_has_a_nearest_one(self, command: Run) -> None:
-        answer = command("status", "--env", "pendulun")
-        assert (answer.code, answer.out) == (2, "")
-        assert "did you mean 'pendulum'?" in answer.err
-
     def test_passwords_appear_nowhere(self, command: Run) -> None:
         for words in (["status"], ["status", "--json"], ["show", "--seed", "5", "--json"]):
             answer = command(*words)

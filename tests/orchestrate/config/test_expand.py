@@ -246,10 +246,8 @@ def test_a_key_that_every_choice_lacks_is_answered_with_the_names_of_all(
 def test_a_key_has_to_be_known_to_one_of_several_grids(sample: Sample) -> None:
     grids = [["model=linear", "model.order=3"], ["model=mlp", "model.order=3"]]
     together = expanded(sample, *grids, sections=SECTIONS)
-    assert [(one.used, one.unused) for one in together] == [
-        (("model.order",), ()),
-        ((), ("model.order",)),
-    ]
+    found = [(one.used, one.unused) for one in together]
+    assert found == [(("model.order",), ()), ((), ("model.order",))]
     with pytest.raises(SpecificationError, match="did you mean 'order'"):
         expanded(sample, *grids, ["model=linear", "model.oder=3"], sections=SECTIONS)
 
@@ -401,10 +399,8 @@ def test_repeated_mappings_are_swept_together(hydra_settings: DictConfig) -> Non
     assert [one.settings["new"] for one in found] == [
         {"a": a, "b": b} for a in (1, 2) for b in (3, 4)
     ]
-    assert [one.overrides for one in found][:2] == [
-        ("++new={a:1}", "++new={b:3}"),
-        ("++new={a:1}", "++new={b:4}"),
-    ]
+    shown = [one.overrides for one in found][:2]
+    assert shown == [("++new={a:1}", "++new={b:3}"), ("++new={a:1}", "++new={b:4}")]
 
 
 NAMES = ("plain", "random", "far/exact", "far/random", "far/trace", "near/plain")

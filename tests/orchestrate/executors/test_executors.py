@@ -87,13 +87,13 @@ def make(executor: str) -> Iterator[Make]:
         one.stop()
 
 
-def new(name: str, run: Run) -> Executor:
+def new(name: str, run: Run, **given: Any) -> Executor:
     if name == "inprocess":
         return InProcessExecutor(run)
     if name == "local":
-        return LocalExecutor(run, workers=WORKERS)
+        return LocalExecutor(run, **{"workers": WORKERS, **given})
     ray = importlib.import_module("orchestrate.executors.ray.executor")
-    return ray.RayExecutor(run, workers=WORKERS)  # type: ignore[no-any-return]
+    return ray.RayExecutor(run, **{"workers": WORKERS, **given})  # type: ignore[no-any-return]
 
 
 @for_all
@@ -282,10 +282,8 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
     assert command_line(*one, "executor=lockstep")[0] == 0
     assert command_line(*one, "executor=inprocess")[0] == 0
     with Reader.open(url) as reader:
-        assert sorted(str(config.config["path"]) for config in reader.configs()) == [
-            "kernel",
-            "reference",
-        ]
+        found = sorted(str(config.config["path"]) for config in reader.configs())
+        assert found == ["kernel", "reference"]
 
 
 LAUNCH = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import socket
@@ -18,14 +17,14 @@ from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Executor, Run, Task, TaskDone, WorkerLost, run_task
+from orchestrate.executors.base import Run, Task, TaskDone, WorkerLost, run_task
 from orchestrate.executors.limits import Limits, TrialTimeoutError, interrupted_after
-from orchestrate.executors.local import CrashReport, LocalExecutor
+from orchestrate.executors.local import CrashReport
 from orchestrate.records import Failure
 from tests.dopt.trials import trial
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.conftest import ALL, ON_RAY, WITH_PROCESSES
-from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
+from tests.orchestrate.executors.test_executors import drain, new, seed_of, tasks
 from tests.orchestrate.faults.laboratory import alive
 from tests.orchestrate.standins import BROKEN_SEED, deadly, exiting, malformed, raising
 from tests.orchestrate.unruly import (
@@ -110,15 +109,7 @@ def test_a_trial_fails_alone_with_its_cause_and_says_where(
 
 @pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
 def test_the_rest_of_its_chunk_runs_without_being_charged(executor: str) -> None:
-    limits = Limits(seconds=LIMIT)
-    kind: Executor
-    if executor == "local":
-        kind = LocalExecutor(deaf, 1, limits)
-    else:
-        kind = importlib.import_module("orchestrate.executors.ray.executor").RayExecutor(
-            deaf, 1, limits=limits
-        )
-    with kind:
+    with new(executor, deaf, workers=1, limits=Limits(seconds=LIMIT)) as kind:
         kind.submit(tasks([0, 1, BROKEN_SEED, 3, 4]))
         events = drain(kind)
     [lost] = [event for event in events if isinstance(event, WorkerLost)]
@@ -175,11 +166,8 @@ def test_a_trial_with_too_little_memory_gets_more_once(launches: Launches, execu
     assert (cause, attempt) == ("out of memory", 2)
     assert launches(wants_a_gigabyte, **settings, retry_memory=4.0, retry="failed") == ExitCode.DONE
     ends = "SELECT attempt, outcome, cause FROM attempt WHERE attempt > 1 ORDER BY attempt"
-    assert launches.query(ends) == [
-        (2, "failed", "out of memory"),
-        (3, "released", "out of memory"),
-        (4, "done", None),
-    ]
+    expected = [(2, "failed", "out of memory"), (3, "released", "out of memory"), (4, "done", None)]
+    assert launches.query(ends) == expected
 
 
 @pytest.fixture

@@ -147,10 +147,8 @@ def test_a_failed_start_of_ray_is_ended_and_tried_once_more() -> None:
         InfrastructureError, match=r"Ray timed out\. It was tried 2 times; the load"
     ):
         start(fail)
-    assert [process.wait(PATIENCE_SECONDS) for process in started] == [
-        -signal.SIGKILL,
-        -signal.SIGKILL,
-    ]
+    found = [process.wait(PATIENCE_SECONDS) for process in started]
+    assert found == [-signal.SIGKILL, -signal.SIGKILL]
 
 
 @pytest.mark.parametrize("code", [errno.EACCES, errno.ENOSPC, None])
