@@ -570,7 +570,7 @@ def _closed(model: mujoco.MjModel, ids: list[int], paths: list[list[int]]) -> li
             tied = paths[one] != paths[other]
         else:
             tied = False
-        found += [_name(model, mujoco.mjtObj.mjOBJ_EQUALITY, e)] * tied
+        found += [_name(model, mujoco.mjtObj.mjOBJ_EQUALITY, int(e))] * tied
     return found
 
 

@@ -509,29 +509,27 @@ class RobotExplorer:
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
 
-        By least squares, with friction and ripple as unsure as they are. References are the
-        instruments: noise of torques accelerates, and would look like less mass.
+        By least squares, with friction and ripple as unsure as they are. Its rows are those of the
+        references: noise of torques accelerates, and would look like less mass.
         """
         learner, stacks = self.learner, []
         pairs = zip(*(learner.innovations(*window)[:2] for window in windows), strict=True)
         missing, friction = map(np.array, pairs)
-        rows = self._carried([means for means, _ in windows])
-        instruments = self._carried([self._led(*window) for window in windows])
+        rows = self._carried([self._led(*window) for window in windows])
         for j, unit in enumerate(learner.noise):
             seen = np.isfinite(missing[:, j])
             H = friction[seen, j]
             root = np.linalg.cholesky(np.eye(len(H)) + H @ learner.covariance[j] @ H.T)
-            parts = np.column_stack([rows[seen, j], instruments[seen, j], missing[seen, j]])
-            stacks.append(np.linalg.solve(root, parts / unit))
-        whole = np.concatenate(stacks)
-        X, Z, wanted = whole[:, :4], whole[:, 4:8], whole[:, 8]
+            parts = np.column_stack([rows[seen, j], missing[seen, j]]) / unit
+            stacks.append(np.linalg.solve(root, parts))
+        design, wanted = np.split(np.concatenate(stacks), [4], axis=1)
         prior = np.eye(4) / self.body.model.body_mass.sum() ** 2
-        inverse = np.linalg.inv(Z.T @ X + prior)
-        found = inverse @ Z.T @ wanted
-        rest = wanted - X @ found
+        found = np.linalg.solve(design.T @ design + prior, design.T @ wanted)
+        rest = wanted - design @ found
         batches = rest[: len(rest) // BATCH * BATCH].reshape(-1, BATCH).sum(axis=1)
         misfit = max(1.0, (batches**2).sum() / max(len(batches), 1) / BATCH)
-        self._unsure = inverse @ (misfit * Z.T @ Z + prior) @ inverse.T
+        self._unsure = np.linalg.inv(design.T @ design / misfit + prior)
+        found = found[:, 0]
         mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
         self.known.hang(mass, found[1:])
         learner.forget(10.0)

@@ -179,7 +179,7 @@ class Unknowns:
             for where in dict.fromkeys(self.body.bodies + self.body.joints)
             for one in kinds
             if where in (self.body.joints if one in OF_JOINTS else self.body.bodies)
-            and (not place or fnmatch.fnmatchcase(where, place))
+            and (place in ("", where) or fnmatch.fnmatchcase(where, place))
         ]
         if not found:
             places = self.body.joints if kind in OF_JOINTS else self.body.bodies

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 NEAR = 5
 """Rows on each side of the first one of a piece by which its velocities are estimated."""
 
-DEFAULTS = ("gear", "armature", "damping")
-"""What default classes may give to an actuator, as MuJoCo names it; early versions lack some."""
-
 
 def sequences(
     body: Body, log: Any, name: str = "log", seconds: float = 1.0
@@ -141,10 +138,10 @@ def _measured(body: Body, dt: float) -> Any:
         part.damping = [linear, *part.damping[1:]] if np.ndim(part.damping) else linear
         motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
-        for kind in DEFAULTS:  # else the file's
+        motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        for kind in ("gear", "armature", "damping"):  # else the defaults of the file
             if hasattr(plain, kind):
                 setattr(motor, kind, getattr(plain, kind))
-        motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
         spec.add_sensor(
             name=f"{joint}_position",
             type=mujoco.mjtSensor.mjSENS_JOINTPOS,

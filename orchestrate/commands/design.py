@@ -150,8 +150,12 @@ def _write_csv(target: Path, problem: Problem, motion: Motion) -> None:
     columns = problem.body.columns(motion)
     with whole(target) as partial:
         rows = np.column_stack(list(columns.values()))
-        head = ",".join(columns)
+        head = ",".join(_quoted(name) if {*name} & {*',"'} else name for name in columns)
         np.savetxt(partial, rows, fmt="%.9g", delimiter=",", header=head, comments="")
+
+
+def _quoted(name: str) -> str:
+    return '"{}"'.format(name.replace('"', '""'))
 
 
 def _write_ros(target: Path, problem: Problem, motion: Motion) -> None:
@@ -183,7 +187,7 @@ def _draw(target: Path, problem: Problem, motion: Motion) -> None:
         for kind, part in parts.items():
             one.plot(motion.times, part[:, k], lw=0.8, label=kind)
         one.set(ylim=(-1.05, 1.05), yticks=(-1, 0, 1))
-        one.set_ylabel(name, rotation=0, ha="right", fontsize=7)
+        one.set_ylabel(name.replace("$", r"\$"), rotation=0, ha="right", fontsize=7)
     axes[0].legend(ncols=3, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     axes[-1].set(xlabel="time [s]")
     figure.supylabel("share of the limit", fontsize=8)

@@ -370,7 +370,7 @@ NEGATIVE = FLAT.replace('izz="3"', 'izz="-1"')
         (f'<robot name="r"><link name="a"/>{FLAT}</robot>', "put <mujoco><compiler balance"),
         (f'<robot name="r"><link name="a"/>{NEGATIVE}</robot>', "expected: correct it"),
         ("", "robot.xml"),
-        ('<robot xmlns:xacro="x" name="r"><xacro:a/><link/></robot>', r"expand it \(xacro robot.xml"),
+        ('<robot xmlns:xacro="x"><xacro:a/><link/></robot>', r"expand it \(xacro robot.xml"),
         (
             """<mujoco><asset><mesh name="m" file="none.stl"/></asset><worldbody><body><joint/>
             <geom type="mesh" mesh="m"/></body></worldbody></mujoco>""",
@@ -531,8 +531,9 @@ def test_what_is_left_out_is_named() -> None:
 
 
 TIED = """<mujoco><worldbody><body name="one"><joint name="a" axis="0 1 0"/><geom size="0.1"/>
-    <site name="tip"/><site name="end"/><body name="two" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size="0.1"/>
-    </body></body></worldbody><equality>%s</equality><actuator><motor joint="a"/>%s</actuator>
+    <site name="tip"/><site name="end"/>
+    <body name="two" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size="0.1"/></body>
+    </body></worldbody><equality>%s</equality><actuator><motor joint="a"/>%s</actuator>
     </mujoco>"""
 
 
@@ -561,7 +562,7 @@ def test_constraints_that_driven_joints_would_break_are_refused(
     if not tied:
         assert Body(model).joints[0] == "a"
         return
-    with pytest.raises(SpecificationError, match="equality0 ties .*: take it from the file"):
+    with pytest.raises(SpecificationError, match=r"equality0 ties .*: take it from the file"):
         Body(model)
 
 

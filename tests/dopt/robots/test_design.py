@@ -236,8 +236,7 @@ def test_numbers_of_problems_are_positive(
 def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_mass(
     tmp_path: Path,
 ) -> None:
-    """A mass that was set once counted for nothing, where the file gives geoms alone; its
-    defaults were those of the motors."""
+    """A mass that was set once counted for nothing; defaults of the file were those of motors."""
     from mujoco import sysid
 
     from dopt.robots.sysid import sequences
@@ -265,7 +264,9 @@ def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_ma
     example = (sequences.__doc__ or "").split("mass:\n\n")[1].split("\n\n    Parameters")[0]
     names: dict[str, Any] = {"sysid": sysid, "sequences": sequences, "body": body, "log": log}
     exec(textwrap.dedent(example), names)
-    fitted = {name: float(names["fitted"][name].value[0]) for name in names["fitted"].keys()}
+    fitted = {
+        name: float(names["fitted"][name].value[0]) for name in ("damping", "dry", "rotor", "mass")
+    }
     mass = body.model.body("hand").mass[0]
     truth = {"damping": 0.8, "dry": 0.5, "rotor": 0.2, "mass": mass}
     assert fitted == pytest.approx(truth, rel=0.02)

@@ -82,6 +82,24 @@ def test_a_design_is_written_as_csv_picture_and_trajectory(
     np.testing.assert_allclose(point["positions"], numbers[798, 1:3], atol=1e-8)
 
 
+def test_names_with_marks_are_kept_in_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A body whose name looks like a wildcard was once unknown; a comma made a column more."""
+    shoulder, elbow = 'left, "$a$"', "link[2]"
+    text = ROBOT.replace('"shoulder"', "'left, &quot;$a$&quot;'").replace('"elbow"', f'"{elbow}"')
+    (tmp_path / "robot.xml").write_text(text.replace('"lower"', '"lower[1]"'))
+    (tmp_path / "limits.yaml").write_text(LIMITS)
+    out = tmp_path / "motion.csv"
+    words = ["--unknown", f"mass:lower[1],damping:{elbow}", "--seconds", "2", "--effort", "1"]
+    assert designed(tmp_path / "robot.xml", *words, "--out", str(out)) == ExitCode.DONE
+    assert "mass:lower[1]" in capsys.readouterr().out
+    with out.open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0][1:3] == [f"q_{shoulder}", f"q_{elbow}"]
+    assert len(rows[1]) == 9
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
