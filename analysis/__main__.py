@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from orchestrate.interrupts import end_at_interrupt
+from dopt.process import collect_rarely, end_at_interrupt
 
 if __name__ == "__main__":
     end_at_interrupt()
 
-from dopt.process import collect_rarely
 from orchestrate.program import run
 
 

@@ -1,4 +1,4 @@
-"""Settings of a process: its cores, its locks of files, and how often it collects garbage.
+"""Settings of a process: its cores, locks of files, garbage, and Ctrl-C while it starts.
 
 The cores follow its affinity, and the quotas of its control groups. Garbage is collected rarely:
 Python searches for unreachable cycles after every 700 new containers. A program that imports large
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -114,3 +115,23 @@ def collect_rarely() -> None:
     For programs, early, as imports gain most; a library leaves the setting to its user.
     """
     gc.set_threshold(NEW_CONTAINERS)
+
+
+def _end(*_: object) -> None:
+    os._exit(130)  # ExitCode.INTERRUPTED, whose module loads more
+
+
+def end_at_interrupt() -> None:
+    """Let Ctrl-C end this process without a traceback, unless it is ignored or handled.
+
+    For programs, before their imports: some libraries make another error of a
+    ``KeyboardInterrupt`` while they are imported, as Hydra does while it composes.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+
+
+def raise_at_interrupt() -> None:
+    """Let Ctrl-C raise ``KeyboardInterrupt`` again: from here on something has to be closed."""
+    if signal.getsignal(signal.SIGINT) is _end:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from orchestrate.interrupts import end_at_interrupt
+from dopt.process import end_at_interrupt
 
 if __name__ == "__main__":
     end_at_interrupt()

@@ -13,12 +13,11 @@ if __package__ in (None, ""):
     # Python puts a script's own folder first; the packages are in the folder above it.
     sys.path[: not sys.flags.safe_path] = [str(Path(__file__).resolve().parents[1])]
 
-from orchestrate.interrupts import end_at_interrupt, raise_at_interrupt
+from dopt.process import collect_rarely, end_at_interrupt, raise_at_interrupt
 
 if __name__ == "__main__":
     end_at_interrupt()
 
-from dopt.process import collect_rarely
 from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.limits import pin_threads
 from orchestrate.program import UsageError, answered, run

@@ -28,8 +28,8 @@ from typing import IO, Any, NoReturn, ParamSpec, TextIO
 
 import dopt
 from dopt.errors import DISTRIBUTION, DoptError, given_path, unknown_name
+from dopt.process import end_at_interrupt, raise_at_interrupt
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError, without_password
-from orchestrate.interrupts import end_at_interrupt, raise_at_interrupt
 
 _INSTALLED = {
     "dopt": "python -m orchestrate",

@@ -48,18 +48,17 @@ NUMBERS = ("analysis/data", "analysis/stats", "analysis/tables")
 BASE = {"errors", "records", "files", "program"}
 ORCHESTRATE_IMPORTS = {
     "errors": set(),
-    "interrupts": set(),
     "records": set(),
     "fingerprint": set(),
     "files": set(),
-    "program": {"errors", "interrupts"},
+    "program": {"errors"},
     "config": BASE,
     "executors": BASE | {"config", "fingerprint"},
     "store": {"errors", "records", "files"},
     "runner": BASE | {"config", "executors", "fingerprint", "store"},
     "commands": BASE | {"runner", "store"},
-    "launch": BASE | {"config", "executors", "interrupts", "runner"},
-    "__main__": BASE | {"commands", "interrupts"},
+    "launch": BASE | {"config", "executors", "runner"},
+    "__main__": BASE | {"commands"},
 }
 """Folders and modules of orchestrate that each one may import."""
 
@@ -152,7 +151,7 @@ def test_what_saves_an_exploration_is_loaded_by_the_first_save() -> None:
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
-    parts = ("store", "files", "interrupts", "program")
+    parts = ("store", "files", "program")
     shared = tuple(f"orchestrate.{part}" for part in parts)
     for path in sources("analysis"):
         names = imports(path)
