@@ -208,7 +208,7 @@ def run_program(words: list[str], cwd: Path, **environment: str) -> tuple[int, s
     return done.returncode, done.stdout, done.stderr
 
 
-@pytest.mark.parametrize("loaded", ["dopt", "dopt.errors", "numpy", "sqlalchemy"])
+@pytest.mark.parametrize("loaded", ["dopt.errors", "numpy", "sqlalchemy"])
 @pytest.mark.parametrize("words", PROGRAMS, ids=lambda words: words[-1])
 def test_an_interrupt_while_libraries_load_ends_a_program_with_130_and_no_traceback(
     words: list[str], loaded: str, tmp_path: Path
