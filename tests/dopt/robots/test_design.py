@@ -18,6 +18,7 @@ from dopt.robots.design import LEAST, Design, Problem, attainable, gradient, mul
 from dopt.robots.limits import Limits
 from dopt.robots.parameters import relative_errors
 from dopt.robots.report import Report
+from dopt.robots.sysid import sequences
 from dopt.robots.trajectories import ROOM, Family, Fourier, Ladder, Multisine, Spline
 from tests.dopt.robots.test_body import FOLD, arm, body_of, jaco, limits, limits_of
 
@@ -237,10 +238,7 @@ def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_ma
     tmp_path: Path,
 ) -> None:
     """A mass that was set once counted for nothing; defaults of the file were those of motors."""
-    from mujoco import sysid
-
-    from dopt.robots.sysid import sequences
-
+    sysid = pytest.importorskip("mujoco.sysid", reason="needs mujoco.sysid")
     (tmp_path / "two.xml").write_text(
         """<mujoco><compiler inertiafromgeom="true"/><option timestep="0.002"/>
       <default><geom contype="0" conaffinity="0"/><motor gear="3" armature="1"
