@@ -189,14 +189,9 @@ def test_a_verdict_needs_the_adjusted_test_and_the_interval(
 
 
 def test_a_page_calls_what_is_worse_worse() -> None:
-    unknown = dict.fromkeys(
-        [
-            f"{measure}_{column}"
-            for measure in (*MEASURES, "same_loss")
-            for column in ("ratio", "low", "high", "p", "p_adjusted")
-        ],
-        math.nan,
-    )
+    columns = ("ratio", "low", "high", "p", "p_adjusted")
+    names = (f"{measure}_{column}" for measure in (*MEASURES, "same_loss") for column in columns)
+    unknown = dict.fromkeys(names, math.nan)
     usual = {"env": "arm", "loss": 1.0, "loss_2se": 0.1, "coverage": 0.3, "coverage_2se": 0.1}
     usual |= {"epsilon": 2.5, "horizon": 500, "steps": math.inf, "reached": 0.25, "dt": 0.02}
     usual |= {"steps_p_adjusted": 0.5, "policy": "d_optimal", "policy_label": "D-optimal"}

@@ -145,14 +145,8 @@ def test_numbers_as_words(words: str, text: str) -> None:
 
 def test_markdown_shows_counts_and_dashes() -> None:
     nothing = {"ratio": math.nan, "low": math.nan, "high": math.nan, "improvement": math.nan}
-    row = {
-        "env": "arm",
-        "variant": "random",
-        "reference": "D-optimal",
-        "n_pairs": 0,
-        "n_diverged": 3,
-        **nothing,
-    }
+    row = {"env": "arm", "variant": "random", "reference": "D-optimal", "n_pairs": 0}
+    row |= {"n_diverged": 3, **nothing}
     table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
     assert "Student's below 30 and above 2000 pairs" in comparison_table(table).note
     line = comparison_table(table).markdown().splitlines()[2]

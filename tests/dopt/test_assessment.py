@@ -37,15 +37,8 @@ from orchestrate.executors.base import Task
 from orchestrate.executors.lockstep import run_batch
 from tests.dopt.trials import trial
 
-SHORT = {
-    "name": "control",
-    "checkpoints": [10],
-    "steps": 12,
-    "settle_steps": 2,
-    "samples": 8,
-    "elites": 2,
-    "lookahead": 3,
-}
+SHORT: dict[str, Any] = {"name": "control", "checkpoints": [10], "steps": 12, "settle_steps": 2}
+SHORT |= {"samples": 8, "elites": 2, "lookahead": 3}
 
 
 def short(env: str, policy: str, seed: int = 1, **task: object) -> TrialSpec:

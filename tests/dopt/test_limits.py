@@ -194,19 +194,11 @@ def sensed(
     env: str, sensors: dict[str, Any], learner: str = "joint_ekf", policy: str = "d_optimal", /, *,
     horizon: int = 30, seed: int = 0, **fields: Any,
 ) -> TrialSpec:  # fmt: skip
-    return trial(
-        env,
-        policy,
-        seed,
-        env={"horizon": horizon, **sensors},
-        policy={"regularization": 3.0} if policy == "d_optimal" else {},
-        model={"name": "mlp"},
-        learner={
-            "name": learner,
-            **({"refit_every": 12} if learner == "joint_ekf" else {}),
-            **fields,
-        },
-    )
+    parts: dict[str, dict[str, Any]] = {"env": {"horizon": horizon, **sensors}}
+    parts["policy"] = {"regularization": 3.0} if policy == "d_optimal" else {}
+    refits = {"refit_every": 12} if learner == "joint_ekf" else {}
+    parts["learner"] = {"name": learner, **refits, **fields}
+    return trial(env, policy, seed, model={"name": "mlp"}, **parts)
 
 
 ABSOLUTE = {"output_matrix": [1, 0, 0, 0, 1, 0, 1, 0], "measurement_noise": [DEGREE, DEGREE]}

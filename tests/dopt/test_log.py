@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import dopt
 from dopt.errors import SpecificationError
 from dopt.log import Log
+from tests.dopt.explorer.plants import MOTOR
 from tests.paths import loaded_by
 
 N = 200
@@ -32,17 +34,9 @@ def said(found: Log, words: str) -> bool:
 
 
 def motor(**more: Any) -> dopt.Plant:
-    given = {
-        "states": {"angle": "rad", "rate": "rad/s"},
-        "inputs": {"v": "V"},
-        "dt": 0.01,
-        "gamma": 6.0,
-        "known": {"angle": "rate", "rate": "40*v"},
-        "learned": ["rate"],
-        "angles": ["angle"],
-        "box": {"rate": 30.0},
-    }
-    return dopt.Plant(**(given | more))
+    given: dict[str, Any] = {"inputs": {"v": "V"}, "dt": 0.01, "box": {"rate": 30.0}}
+    given |= {"known": {"angle": "rate", "rate": "40*v"}, "constants": {}}
+    return dataclasses.replace(MOTOR, **(given | more))
 
 
 # What a clean table is

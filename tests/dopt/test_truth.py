@@ -107,17 +107,9 @@ def test_forgetting_follows_a_drift_that_memory_averages() -> None:
     """Paired over seeds: the loss in the second half of the trial, against the truth of then."""
 
     def losses(forgetting: float) -> np.ndarray:
-        specs = [
-            trial(
-                "drifting_pendulum",
-                "random_held",
-                seed,
-                env={"horizon": 600, "grid_points": (16, 16)},
-                model={"name": "linear"},
-                learner={"name": "ekf", "forgetting": forgetting},
-            )
-            for seed in range(8)
-        ]
+        parts: dict[str, Any] = {"env": {"horizon": 600, "grid_points": (16, 16)}}
+        parts |= {"model": {"name": "linear"}, "learner": {"name": "ekf", "forgetting": forgetting}}
+        specs = [trial("drifting_pendulum", "random_held", seed, **parts) for seed in range(8)]
         return np.array([run_trial(spec).loss[300:].mean() for spec in specs])
 
     gain = np.log(losses(1.0) / losses(0.98))

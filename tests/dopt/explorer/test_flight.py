@@ -69,17 +69,9 @@ def test_the_plan_is_that_of_a_simulated_system_behind_the_same_delay(policy: st
     """
     widths = (math.pi, 5.0)
     pendulum = Pendulum(horizon=60, grid_points=(4, 4), grid_half_widths=widths, gamma=1.0)
-    plant = Plant(
-        states={"angle": "rad", "rate": "rad/s"},
-        inputs={"torque": "N m"},
-        dt=pendulum.dt,
-        gamma=pendulum.gamma,
-        known={"angle": "rate", "rate": "3 * torque"},
-        learned=["rate"],
-        angles=["angle"],
-        box={"rate": 5.0},
-        delay=2 * pendulum.dt,
-    )
+    numbers: dict[str, Any] = {"dt": pendulum.dt, "gamma": pendulum.gamma, "box": {"rate": 5.0}}
+    known = {"angle": "rate", "rate": "3 * voltage"}
+    plant = declared(known=known, constants={}, delay=2 * pendulum.dt, **numbers)
     real = Explorer(Real(pendulum, delay=2), policy=policy)
     own = Explorer(plant, steps=60, policy=policy)
     x = np.zeros(4)
