@@ -83,11 +83,11 @@ def test_a_fit_finds_the_parameters_of_a_robot_without_noise() -> None:
     assert np.sqrt((((found - off) / one.errors)[sure] ** 2).mean()) < 1.0
 
 
-STUDIES = Path(__file__).parents[2] / "studies"
+FOLDER = Path(__file__).parents[2] / "studies"
 
 
 def test_every_study_has_a_page_that_the_list_names() -> None:
-    page = (STUDIES / "README.md").read_text()
-    folders = [part.parent for part in STUDIES.glob("*/__init__.py")]
+    page = (FOLDER / "README.md").read_text()
+    folders = [part.parent for part in FOLDER.glob("*/__init__.py")]
     assert [one.name for one in folders if not (one / "README.md").exists()] == []
     assert [one.name for one in folders if f"({one.name}/README.md)" not in page] == []
