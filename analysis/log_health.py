@@ -125,7 +125,7 @@ class Effect:
 
     @property
     def may_be_closed(self) -> bool:
-        """Whether feedback and an input as regular as the motion are not told apart."""
+        """Return whether feedback and an input as regular as the motion are not told apart."""
         return self.follows_state or (self.feedback > BETWEEN and not self.closed_loop)
 
 

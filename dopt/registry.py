@@ -11,6 +11,7 @@ import ast
 import codecs
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib.util
 import inspect
@@ -19,7 +20,6 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping
-from functools import partial
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -161,13 +161,23 @@ def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any)
         missing += [key for key in sorted(declared - {"name"}) if not hasattr(own, key)]
     if missing:
         raise _unfit(section, path, f"a class that defines {', '.join(missing)}")
-    for base in (base for base in own.__mro__ if base.__module__.startswith("dopt.")):
-        if unlike := _unlike(base, lambda key: inspect.getattr_static(own, key).__get__(0, own)):
-            raise _unfit(section, path, f"a class with {', '.join(unlike)}")
+    if unlike := _unlike_bases(cls):
+        raise _unfit(section, path, f"a class with {', '.join(unlike)}")
     name = own.__dict__.get("name")
     if not isinstance(name, str) or name in registry:
         raise _unfit(section, path, "a class with a 'name' of its own, which no other has")
     return own
+
+
+@functools.cache
+def _unlike_bases(own: type) -> list[str]:
+    """Return the methods whose arguments differ from a base's; a class is looked at once."""
+
+    def method_of(key: str) -> Any:
+        return inspect.getattr_static(own, key).__get__(0, own)
+
+    bases = (base for base in own.__mro__ if base.__module__.startswith("dopt."))
+    return next((unlike for base in bases if (unlike := _unlike(base, method_of))), [])
 
 
 def _unlike(base: type, method_of: Callable[[str], Any]) -> list[str]:
@@ -398,7 +408,7 @@ def check_returned(whose: str, method: str, found: object, base: type) -> None:
     """
     wanted = [key for key, value in vars(base).items() if callable(value) and key[0] != "_"]
     missing = [key for key in wanted if not callable(getattr(found, key, None))]
-    missing = missing or _unlike(base, partial(getattr, found))
+    missing = missing or _unlike(base, functools.partial(getattr, found))
     if not missing and not isinstance(found, type):
         return
     shown, remedy = "None", f"add the return statement to {method}()"

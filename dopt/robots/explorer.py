@@ -509,8 +509,8 @@ class RobotExplorer:
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
 
-        By least squares, with friction and ripple as unsure as they are. Its rows are those of the
-        references: noise of torques accelerates, and would look like less mass.
+        By least squares, with friction and ripple as unsure as they are. Its rows are of
+        the references: noise of torques accelerates, and would look like less mass.
         """
         learner, stacks = self.learner, []
         pairs = zip(*(learner.innovations(*window)[:2] for window in windows), strict=True)

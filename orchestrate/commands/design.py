@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from orchestrate.commands import Command, answer
 from orchestrate.errors import ExitCode
 from orchestrate.files import whole, writing
@@ -147,15 +145,11 @@ def _design(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
 
 
 def _write_csv(target: Path, problem: Problem, motion: Motion) -> None:
-    columns = problem.body.columns(motion)
+    import pandas as pd
+
+    columns = pd.DataFrame(problem.body.columns(motion))
     with whole(target) as partial:
-        rows = np.column_stack(list(columns.values()))
-        head = ",".join(_quoted(name) if {*name} & {*',"'} else name for name in columns)
-        np.savetxt(partial, rows, fmt="%.9g", delimiter=",", header=head, comments="")
-
-
-def _quoted(name: str) -> str:
-    return '"{}"'.format(name.replace('"', '""'))
+        columns.to_csv(partial, index=False, float_format="%.9g", compression=None)
 
 
 def _write_ros(target: Path, problem: Problem, motion: Motion) -> None:

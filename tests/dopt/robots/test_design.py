@@ -237,7 +237,7 @@ def test_numbers_of_problems_are_positive(
 def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_mass(
     tmp_path: Path,
 ) -> None:
-    """A mass that was set once counted for nothing; defaults of the file were those of motors."""
+    """A mass that was set once counted for nothing, and motors had the defaults of the file."""
     sysid = pytest.importorskip("mujoco.sysid", reason="needs mujoco.sysid")
     (tmp_path / "two.xml").write_text(
         """<mujoco><compiler inertiafromgeom="true"/><option timestep="0.002"/>
