@@ -22,11 +22,14 @@ from dopt.learning import Adam
 from dopt.learning.base import CustomLearner, check_update
 from dopt.policies import DOptimal, InformationPolicy, Uniform
 from dopt.policies.base import OpenLoop, check_choice
-from dopt.policies.d_optimal import count_sketch
+from dopt.policies.d_optimal import best_on_sphere, count_sketch
 from dopt.randomness import draw, episode_seed
 from dopt.reference.models import (
     BatchInformation,
     BatchModel,
+    Module,
+    NetworkFunction,
+    TrialInformation,
     d_optimal_inputs,
     flat,
     gradients_and_changes,
@@ -43,10 +46,11 @@ from dopt.reference.models import (
 )
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from dopt.systems.base import next_state
+from dopt.systems.base import feature_values, next_state
 from dopt.systems.black_box import BlackBox, new_start
+from dopt.systems.properties import STEP
 from dopt.trial_view import TrialView
-from dopt.types import Array
+from dopt.types import Array, Scalar
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
@@ -71,6 +75,8 @@ class BatchSteps:
         Visited states, applied inputs and observed accelerations; NaN where no trial has come yet.
     sampled_states : (n, T, d) tensor
         States at which the accelerations were observed.
+    sampled_points : (n, T, ...) tensor
+        What the model is a function of, there.
     information : BatchInformation or None
         M in the space to which ``project`` maps gradients, (..., q).
     diverged : (n, 1) tensor
@@ -129,6 +135,7 @@ class BatchSteps:
             for size in sizes
         )
         self.sampled_states = torch.full_like(self.states[:, 1:], torch.nan)
+        self.sampled_points = self.model.points(self.sampled_states)
         if not isinstance(system, BlackBox):  # which starts where its episodes do
             self.states[:, 0] = self.tensor(np.array(system.initial_state))
         self._rows = torch.tensor(system.learned_rows, device=self.device)
@@ -146,7 +153,8 @@ class BatchSteps:
             self._sketch = torch.zeros(q, policy.sketch_size).to(self.theta)
             places = torch.tensor(buckets.astype(np.int64))
             self._sketch[torch.arange(q), places] = torch.tensor(signs).to(self.theta)
-        self.information = BatchInformation(held.regularization, self.project(self.theta))
+        kind = TrialInformation if isinstance(self, NetworkSteps) else BatchInformation
+        self.information = kind(held.regularization, self.project(self.theta))
 
     def project(self, rows: Tensor) -> Tensor:
         """Return gradients, (..., q), in the space of M, (..., s): as they are, or their sketch."""
@@ -161,12 +169,14 @@ class BatchSteps:
         system, x, u = self.system, self.states[:, t], self.inputs[:, t]
         at = x if system.integrator == "euler" else 0.5 * (x + self.states[:, t + 1])
         self.sampled_states[:, t] = at
+        points = self.model.points(at.unsqueeze(1))
+        self.sampled_points[:, t] = points.squeeze(1)
         known = known_flow(system, at, u)
         observed = ((self.states[:, t + 1] - x) / dt - known).index_select(1, self._rows)
         if system.integrator != "euler":
             end = model_states(system, self.model, self.theta, x, u, dt)
             step = ((end - x) / dt - known).index_select(1, self._rows)
-            observed = observed - (step - self.model(self.theta, at.unsqueeze(1)).squeeze(1))
+            observed = observed - (step - self.model.at(self.theta, points).squeeze(1))
         self.targets[:, t] = observed
 
     def plan(self, t: int) -> Tensor:
@@ -210,8 +220,8 @@ class BatchSteps:
         for i in self.alive() if self.planners else ():
             self.planners[i].observe(BatchTrialView(self, i, t + 1))
         if self.information is not None:
-            x = self.sampled_states[:, t : t + 1]
-            J = jacobian(self.model, self.system.n_learned, self.theta, x)
+            points = self.sampled_points[:, t : t + 1]
+            J = jacobian(self.model, self.system.n_learned, self.theta, points)
             self.information.add(self.project(J[:, 0]))
 
     def alive(self) -> list[int]:
@@ -241,7 +251,7 @@ class BatchTrialView(TrialView):
         return _array(self._model(self._theta[None], self._tensor(states)[None])[0])
 
     def jacobian(self, state: Array) -> Array:
-        at = self._tensor(state)[None, None]
+        at = self._model.points(self._tensor(state)[None, None])
         return _array(jacobian(self._model, self.system.n_learned, self._theta[None], at)[0, 0])
 
     def jacobian_change(self, state: Array, directions: Array) -> Array:
@@ -294,7 +304,7 @@ class AdamLearner:
         batch, rule = self._batch, self._rule
         newest = slice(max(0, t + 1 - rule.window), t + 1)
         gradient = loss_gradient(
-            batch.model, batch.theta, batch.sampled_states[:, newest], batch.targets[:, newest]
+            batch.model, batch.theta, batch.sampled_points[:, newest], batch.targets[:, newest]
         )
         first, second = self._moments
         first.lerp_(gradient, 1.0 - rule.beta_1)
@@ -304,12 +314,12 @@ class AdamLearner:
         batch.theta.addcdiv_(first, unbiased.add_(rule.epsilon), value=-rate)
 
 
-def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:
-    """Return the gradient of mean_N ‖a_θ(x) - y‖² by θ, (n, q), at (n, N, d) and (n, N, r)."""
+def loss_gradient(model: BatchModel, theta: Tensor, points: Tensor, targets: Tensor) -> Tensor:
+    """Return the gradient of mean_N ‖a_θ - y‖² by θ, (n, q), at points (n, N, ·), y (n, N, r)."""
     with torch.enable_grad():
         at, leaves = model.leaves(theta)
-        values = model(at, states)
-        slope = 2.0 / states.shape[1] * (values.detach() - targets)
+        values = model.at(at, points)
+        slope = 2.0 / points.shape[1] * (values.detach() - targets)
         parts = torch.autograd.grad(values, leaves, slope, materialize_grads=True)
     return flat(parts).view_as(theta)
 
@@ -324,9 +334,9 @@ class LeastSquaresLearner:
 
     def learn(self, t: int) -> None:
         """Absorb the sample of step t."""
-        batch, x = self._batch, self._batch.sampled_states[:, t : t + 1]
-        J = jacobian(batch.model, batch.system.n_learned, batch.theta, x)[:, 0]
-        offset = batch.model(torch.zeros_like(batch.theta), x).squeeze(1)
+        batch, points = self._batch, self._batch.sampled_points[:, t : t + 1]
+        J = jacobian(batch.model, batch.system.n_learned, batch.theta, points)[:, 0]
+        offset = batch.model.at(torch.zeros_like(batch.theta), points).squeeze(1)
         right = (batch.targets[:, t] - offset).unsqueeze(-1)
         self._normal = self._normal + J.mT @ J
         self._moment = self._moment + (J.mT @ right).squeeze(-1)
@@ -439,6 +449,97 @@ class Lockstep(BatchSteps):
         return time.perf_counter()
 
 
+class NetworkSteps(BatchSteps):
+    """The steps of one trial of a custom network, with arrays in place of small tensors.
+
+    They share the memory of the batch. An operation on a tensor of a few numbers costs several
+    times that on an array.
+    """
+
+    def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
+        super().__init__(specs, device)
+        assert isinstance(self.model, NetworkFunction)
+        self._network = self.model
+        shared = (self.states, self.inputs, self.targets, self.sampled_states, self.sampled_points)
+        self._x, self._u, self._y, self._at, self._phi = (tensor[0].numpy() for tensor in shared)
+        self._scales, self._learned = self.system.feature_scales, list(self.system.learned_rows)
+
+    def _features(self, x: Sequence[Scalar]) -> list[Any]:
+        return feature_values(self.system.features, self._scales, x)
+
+    def _point(self, x: Array) -> Tensor:
+        return torch.from_numpy(np.array(self._features(tuple(x))))
+
+    def _known(self, x: Array, u: Array) -> Array:
+        return np.array(self.system.known(tuple(x), tuple(u), self.system.parameters))
+
+    def _accelerations(self, x: Array) -> Array:
+        return self._network.value(self.theta[0], self._point(x)).numpy()
+
+    def _following(self, x: Array, u: Array, dt: float) -> Array:
+        """Return the state, (d,), that the model predicts dt seconds after x under an input."""
+
+        def rate(z: Array) -> Array:
+            slope = self._known(z, u)
+            slope[self._learned] += self._accelerations(z)
+            return slope
+
+        following: Array = next_state(self.system.integrator, rate, x, dt)
+        return following
+
+    def learn(self, t: int) -> None:
+        """Update the parameters with the samples up to step t."""
+        self.learner.learn(t)
+
+    def observe(self, t: int, dt: float) -> None:
+        """Store the accelerations observed in step t, as a batch does."""
+        x, u, euler = self._x[t], self._u[t], self.system.integrator == "euler"
+        at = x if euler else 0.5 * (x + self._x[t + 1])
+        self._at[t], self._phi[t] = at, self._features(tuple(at))
+        if euler:
+            rest = (self._x[t + 1] - x) / dt - self._known(at, u)
+            self._y[t] = rest[self._learned]
+        else:
+            rest = (self._x[t + 1] - self._following(x, u, dt)) / dt
+            self._y[t] = rest[self._learned] + self._accelerations(at)
+
+    def plan(self, t: int) -> Tensor:
+        """Return the input u_t, (1, m), as a batch does."""
+        system, policy, information = self.system, self.config.policy, self.information
+        if t == 0 or self.planners or information is None or not isinstance(policy, DOptimal):
+            return super().plan(t)
+        columns = self.project(self._planning_columns(t))[None]
+        (Q,), (v,) = (part.numpy() for part in quadratic_problem(columns, information))
+        u = best_on_sphere(Q, v, self.ties[0, t].numpy(), system.gamma)
+        return torch.from_numpy(u)[None]
+
+    def _planning_columns(self, t: int) -> Tensor:
+        """Return g and the columns of D B as rows, (1 + m, q)."""
+        system, m = self.system, self.system.n_inputs
+        bar = self._following(self._x[t], np.zeros(m), system.dt)
+        B = np.array([self._known(bar, move).imag for move in 1j * STEP * np.eye(m)])
+        moved = [self._features(tuple(bar + 1j * system.dt * b)) for b in B]
+        along = torch.from_numpy(np.imag(moved) / STEP)
+        component = int(self.components[0, t])
+        return self._network.gradient_and_changes(self.theta[0], self._point(bar), component, along)
+
+
+class NetworkTrial(NetworkSteps, Lockstep):
+    """One trial of a custom network on this processor."""
+
+    def act(self, t: int, u: Tensor) -> None:
+        """Apply u_t, and store x_{t+1} (equation 2) and the observed accelerations."""
+        if self._episodes:
+            super().act(t, u)
+            return
+        system, x = self.system, self._x[t]
+        self._u[t] = u[0].numpy()
+        rate = functools.partial(system.derivative, inputs=self._u[t], step=t)
+        following = next_state(system.integrator, rate, x, system.dt)
+        self._x[t + 1] = following + self.noise[0, t].numpy()
+        self.observe(t, system.dt)
+
+
 @torch.no_grad()
 def run_trials(
     specs: Sequence[TrialSpec], device: str = "cpu", noted: Sequence[int] | None = None
@@ -450,7 +551,8 @@ def run_trials(
     of those at which the trial is assessed.
     """
     wall, cpu = time.perf_counter(), time.process_time()
-    batch = Lockstep(specs, device)
+    alone = len(specs) == 1 and device == "cpu" and isinstance(specs[0].model, Module)
+    batch = (NetworkTrial if alone else Lockstep)(specs, device)
     noted = specs[0].assessed_steps if noted is None else noted
     for t in range(batch.system.horizon + 1):
         if t in noted:
@@ -498,7 +600,8 @@ class ReferenceSteps:
 
     @torch.no_grad()
     def __init__(self, spec: TrialSpec) -> None:
-        self._spec, self._batch = spec, BatchSteps([spec])
+        kind = NetworkSteps if isinstance(spec.model, Module) else BatchSteps
+        self._spec, self._batch = spec, kind([spec])
         self.states: Array = self._batch.states[0].numpy()
         self.inputs: Array = self._batch.inputs[0].numpy()
         self.errors: Array = np.full(spec.system.horizon, np.nan)
@@ -550,7 +653,7 @@ class ReferenceSteps:
         """
         batch = self._batch
         batch.observe(t, dt)
-        predicted = batch.model(batch.theta, batch.sampled_states[:, t : t + 1])
+        predicted = batch.model.at(batch.theta, batch.sampled_points[:, t : t + 1])
         self.errors[t] = float(torch.linalg.vector_norm(batch.targets[0, t] - predicted[0, 0]))
         batch.learn(t)
         batch.inform(t)

@@ -23,7 +23,6 @@ import functools
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -39,7 +38,6 @@ from dopt.models import MLP, Linear, Model
 from dopt.policies.d_optimal import best_on_sphere
 from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
 from dopt.systems.base import System, feature_values, next_state
-from dopt.systems.properties import STEP
 from dopt.types import Array, Scalar
 
 
@@ -136,11 +134,6 @@ class NetworkFunction(BatchModel):
         self._over_trials = vmap(self._network)
         self._over_both = vmap(vmap(self._network, in_dims=(None, 0)))
 
-    def points(self, x: Tensor) -> Tensor:
-        if x.numel() > x.shape[-1] or x.requires_grad:
-            return super().points(x)
-        return x.new_tensor(self._values(x.flatten())).view(*x.shape[:-1], -1)
-
     def at(self, theta: Tensor, points: Tensor) -> Tensor:
         n, N = len(theta), points.shape[1]
         if n == 1 and not (theta.requires_grad or points.requires_grad):
@@ -156,23 +149,28 @@ class NetworkFunction(BatchModel):
     def leaves(self, theta: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
         return (theta, self.parameters) if len(theta) == 1 else super().leaves(theta)
 
-    def jacobian(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return ∂a/∂θ, (r, q), for parameters (q,) at a state (d,).
+    def value(self, theta: Tensor, phi: Tensor) -> Tensor:
+        """Return a_θ, (r,), for parameters (q,) at the features of a state, (p,)."""
+        self._theta.copy_(theta)
+        value: Tensor = self._module(phi)
+        return value
+
+    def jacobian(self, theta: Tensor, phi: Tensor) -> Tensor:
+        """Return ∂a/∂θ, (r, q), for parameters (q,) at the features of a state, (p,).
 
         A pass backward for each row costs less than one for a batch of copies.
         """
         self._theta.copy_(theta)
         with torch.enable_grad():
-            return _rows(self._module(self.points(x)), self.parameters, self._units)
+            return _rows(self._module(phi), self.parameters, self._units)
 
     def gradient_and_changes(
-        self, theta: Tensor, x: Tensor, component: int, directions: Tensor
+        self, theta: Tensor, phi: Tensor, component: int, directions: Tensor
     ) -> Tensor:
-        """Return g and its derivatives along directions (m, d), (1 + m, q), at a state (d,)."""
+        """Return g and its derivatives along directions of the features, (m, p): (1 + m, q)."""
         self._theta.copy_(theta)
-        moved = x.new_tensor([self._values(x, along) for along in directions.tolist()])
         with torch.enable_grad():
-            phi = self.points(x).requires_grad_()
+            phi = phi.requires_grad_()
             *g, slope = torch.autograd.grad(
                 self._module(phi),
                 (*self.parameters, phi),
@@ -180,16 +178,8 @@ class NetworkFunction(BatchModel):
                 create_graph=True,
                 materialize_grads=True,
             )
-            changes = _rows(slope, self.parameters, moved.unbind())
+            changes = _rows(slope, self.parameters, directions.unbind())
         return torch.cat([flat(g).detach()[None], changes])
-
-    def _values(self, x: Tensor, along: Sequence[float] | None = None) -> list[float]:
-        """Return the features of a state (d,), or their derivatives along a direction."""
-        state: list[Any] = x.tolist()
-        if along is not None:
-            state = [value + 1j * STEP * part for value, part in zip(state, along, strict=True)]
-        values = feature_values(self._system.features, self._system.feature_scales, state)
-        return values if along is None else [value.imag / STEP for value in values]
 
     def _network(self, theta: Tensor, phi: Tensor) -> Tensor:
         parts = zip(theta.split(self._lengths), self.parameters, strict=True)
@@ -240,27 +230,13 @@ def stack(values: Sequence[Scalar]) -> Tensor:
 
 def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
     """Return the known part of dx/dt, (..., d), for states (..., d) and inputs (..., m)."""
-    if _alone(x, u):
-        with suppress(ArithmeticError):  # tensors give infinity or NaN
-            return x.new_tensor([system.known(x[0].tolist(), u[0].tolist(), system.parameters)])
     return stack(system.known(x.unbind(-1), u.unbind(-1), system.parameters))
-
-
-def _alone(*tensors: Tensor) -> bool:
-    """Return whether rows of numbers, (1, ·), belong to one trial and are not differentiated.
-
-    Numbers of Python then cost a tenth of tensors of one element.
-    """
-    return all(len(one) == 1 and one.dim() == 2 and not one.requires_grad for one in tensors)
 
 
 def true_accelerations(system: System, x: Tensor, u: Tensor, step: int) -> Tensor:
     """Return a at a step, (..., r), for states (..., d) and inputs (..., m)."""
     parameters = system.history[min(step, len(system.history) - 1)].tolist()
     point = torch.cat([x, u], dim=-1) if system.reads_inputs else x
-    if _alone(point):
-        with suppress(ArithmeticError):
-            return x.new_tensor([system.accelerations(point[0].tolist(), parameters)])
     return stack(system.accelerations(point.unbind(-1), parameters))
 
 
@@ -290,12 +266,6 @@ def model_states(
 def input_matrix(system: System, x: Tensor) -> Tensor:
     """Return B = dt ∂known/∂u, (n, d, m), at states (n, d)."""
     n, d = x.shape
-    if _alone(x):
-        steps = (1j * STEP * np.eye(system.n_inputs)).tolist()
-        with suppress(ArithmeticError):
-            rates = [system.known(x[0].tolist(), step, system.parameters) for step in steps]
-            slopes = [[complex(rate).imag / STEP for rate in of_input] for of_input in rates]
-            return system.dt * x.new_tensor([slopes]).mT
     with torch.enable_grad():
         u = x.new_zeros(n, d, system.n_inputs).requires_grad_()
         known = known_flow(system, x.unsqueeze(1).expand(-1, d, -1), u)
@@ -307,15 +277,15 @@ def input_matrix(system: System, x: Tensor) -> Tensor:
     return system.dt * columns
 
 
-def jacobian(model: BatchModel, r: int, theta: Tensor, x: Tensor) -> Tensor:
-    """Return J = ∂a/∂θ, (n, N, r, q), of r accelerations for parameters (n, q) at (n, N, d)."""
-    (n, N), q = x.shape[:2], theta.shape[1]
+def jacobian(model: BatchModel, r: int, theta: Tensor, points: Tensor) -> Tensor:
+    """Return J = ∂a/∂θ, (n, N, r, q), of r accelerations for parameters (n, q) at (n, N, ·)."""
+    (n, N, *shape), q = points.shape, theta.shape[1]
     if n * N == 1 and isinstance(model, NetworkFunction):
-        return model.jacobian(theta[0], x[0, 0]).view(1, 1, r, q)
+        return model.jacobian(theta[0], points[0, 0]).view(1, 1, r, q)
     with torch.enable_grad():
         each = theta.detach()[:, None, None].expand(n, N, r, q).reshape(-1, q).requires_grad_()
-        values = model(each, x.unsqueeze(2).expand(n, N, r, -1).reshape(len(each), 1, -1))
-        total = values.view(-1, r, r).diagonal(dim1=1, dim2=2).sum()
+        at = points.unsqueeze(2).expand(n, N, r, *shape).reshape(len(each), 1, *shape)
+        total = model.at(each, at).view(-1, r, r).diagonal(dim1=1, dim2=2).sum()
         (J,) = torch.autograd.grad(total, each, materialize_grads=True)
     return J.view(n, N, r, q)
 
@@ -524,6 +494,28 @@ class BatchInformation:
         return torch.cholesky_solve(columns, cholesky_factor(self._held))
 
 
+class TrialInformation(BatchInformation):
+    """The same for one trial on this processor: numpy is faster with a few columns."""
+
+    def add(self, J: Tensor) -> None:
+        if self._is_small:
+            return super().add(J)
+        held, rows = self._held[0], J[0].numpy()
+        along = held.numpy() @ rows.T
+        try:
+            factor = np.linalg.cholesky(np.eye(len(rows)) + rows @ along)
+        except np.linalg.LinAlgError:
+            factor = np.full((len(rows), len(rows)), np.nan)
+        roots = torch.from_numpy(np.linalg.solve(factor, along.T))
+        held.addmm_(roots.mT, roots, alpha=-1)
+        return None
+
+    def solve(self, columns: Tensor) -> Tensor:
+        if self._is_small:
+            return super().solve(columns)
+        return torch.from_numpy(self._held[0].numpy() @ columns[0].numpy())[None]
+
+
 def cholesky_factor(matrix: Tensor) -> Tensor:
     """Return the lower Cholesky factors of matrices, (n, s, s); NaN where one is indefinite."""
     factor, failed = torch.linalg.cholesky_ex(matrix)
@@ -543,8 +535,6 @@ def planning_columns(
     bar = predicted_states(system, model, theta, x).detach()
     B = input_matrix(system, bar)
     n, m = len(x), B.shape[2]
-    if n == 1 and isinstance(model, NetworkFunction):
-        return model.gradient_and_changes(theta[0], bar[0], int(components[0]), B[0].mT)[None]
     g, DB = gradients_and_changes(
         model,
         theta.repeat_interleave(m, dim=0),

@@ -20,15 +20,18 @@ from dopt.reference.models import (
     SMALL,
     BatchInformation,
     NetworkFunction,
+    TrialInformation,
     gradients_and_changes,
+    input_matrix,
     jacobian,
     planning_columns,
+    predicted_states,
 )
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.custom_networks import Stack
-from tests.dopt.trials import PAIRS, SMALL_SEARCHES, covering, trial
+from tests.dopt.trials import KNOWN_EFFECT, PAIRS, SMALL_SEARCHES, covering, trial
 
 
 def test_a_model_whose_slope_is_free_of_its_parameters_does_not_change_its_gradient() -> None:
@@ -51,8 +54,8 @@ def test_a_network_that_does_not_use_a_parameter_has_zeros_there() -> None:
             self.unused = torch.nn.Parameter(torch.ones(2, dtype=torch.float64))
 
     function = NetworkFunction(SYSTEMS["pendulum"](), Partly())
-    theta, x = torch.ones(2, 6, dtype=torch.float64), torch.ones(2, 3, 2, dtype=torch.float64)
-    J = jacobian(function, 1, theta, x)
+    theta, phi = torch.ones(2, 6, dtype=torch.float64), torch.ones(2, 3, 3, dtype=torch.float64)
+    J = jacobian(function, 1, theta, phi)
     assert torch.equal(J[..., 4:], torch.zeros_like(J[..., 4:]))
     assert bool((J[..., :4] != 0).all())
 
@@ -67,14 +70,16 @@ def test_one_trial_has_the_derivatives_of_a_batch(env: str) -> None:
     function = NetworkFunction(system, module)
     q = sum(parameter.numel() for parameter in function._module.parameters())
     theta, x = 0.5 * torch.randn(2, q).double(), torch.randn(2, system.n_states).double()
-    k = torch.tensor([r - 1, 0])
+    k, points = torch.tensor([r - 1, 0]), function.points(x[:, None])
     both = planning_columns(system, function, theta, x, k)
-    rows = jacobian(function, r, theta, x[:, None])
+    rows = jacobian(function, r, theta, points)
     for i in range(2):
-        one = theta[i : i + 1], x[i : i + 1]
-        columns = planning_columns(system, function, *one, k[i : i + 1])
-        torch.testing.assert_close(columns[0], both[i], rtol=1e-9, atol=1e-11)
-        found = jacobian(function, r, one[0], one[1][:, None])
+        bar = predicted_states(system, function, theta, x)[i : i + 1]
+        moved = torch.func.jacfwd(function.points)(bar[0]) @ input_matrix(system, bar)[0]
+        phi = function.points(bar)[0].detach()
+        columns = function.gradient_and_changes(theta[i], phi, int(k[i]), moved.mT.detach())
+        torch.testing.assert_close(columns, both[i], rtol=1e-9, atol=1e-11)
+        found = jacobian(function, r, theta[i : i + 1], points[i : i + 1])
         torch.testing.assert_close(found[0], rows[i], rtol=1e-9, atol=1e-12)
 
 
@@ -197,16 +202,19 @@ SIZES = (7, SMALL, SMALL + 1, 150)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_it_solves_as_a_fresh_factorisation(size: int) -> None:
+@pytest.mark.parametrize(("n", "kind"), [(3, BatchInformation), (1, TrialInformation)])
+def test_it_solves_as_a_fresh_factorisation(
+    size: int, n: int, kind: type[BatchInformation]
+) -> None:
     rng = torch.Generator().manual_seed(size)
-    M = 0.1 * torch.eye(size, dtype=torch.float64).repeat(3, 1, 1)
-    information = BatchInformation(0.1, M[:, 0])
+    M = 0.1 * torch.eye(size, dtype=torch.float64).repeat(n, 1, 1)
+    information = kind(0.1, M[:, 0])
     scales = torch.logspace(-1.5, 1.5, size, dtype=torch.float64)
     for step in range(48):
-        rows = torch.randn(3, 1 + step % 3, size, generator=rng, dtype=torch.float64) * scales
+        rows = torch.randn(n, 1 + step % 3, size, generator=rng, dtype=torch.float64) * scales
         information.add(rows)
         M = M + rows.mT @ rows
-        columns = torch.randn(3, size, 2, generator=rng, dtype=torch.float64)
+        columns = torch.randn(n, size, 2, generator=rng, dtype=torch.float64)
         expected = torch.linalg.solve(M, columns)
         gap = (information.solve(columns) - expected).abs().max() / expected.abs().max()
         assert gap < 1e-8
@@ -221,6 +229,9 @@ def test_a_trial_without_a_factor_has_no_solution_and_the_others_keep_theirs(siz
     solved = information.solve(columns)
     assert solved[0].isnan().all()
     assert solved[1].isfinite().all()
+    alone = TrialInformation(1.0, torch.zeros(1, size, dtype=torch.float64))
+    alone.add(rows[:1])
+    assert alone.solve(columns[:1]).isnan().all()
 
 
 def test_the_steps_are_those_of_the_optimizer_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,9 +351,32 @@ def test_a_wrong_network_is_refused_in_a_sentence(
 LOCKSTEP = [pair for pair in PAIRS if pair[1] in ("random", "uniform", "d_optimal", "oracle")]
 
 
+OWN: list[dict[str, Any]] = [
+    *({"name": name} for name in KNOWN_EFFECT),
+    {"integrator": "rk4"},
+    {"name": "quadrotor", "integrator": "rk4", "width": 3},
+    {"width": 3},
+    {"policy": {"name": "uniform"}},
+    {"policy": {"form": "sketch", "sketch_size": 120}},
+]
+
+
 @pytest.mark.parametrize(("env", "policy"), sorted({*covering(LOCKSTEP), *LOCKSTEP[:8]}))
 def test_a_batch_is_its_trials_one_by_one(env: str, policy: str) -> None:
-    specs = [trial(env, policy, seed, env={"horizon": 5}) for seed in range(3)]
+    check_one_by_one([trial(env, policy, seed, env={"horizon": 5}) for seed in range(3)])
+
+
+@pytest.mark.parametrize("given", OWN, ids=str)
+def test_a_network_alone_is_one_of_a_batch(given: dict[str, Any]) -> None:
+    """A trial alone works with arrays, a batch with tensors."""
+    model = {"_target_": f"{HERE}.Stack", "width": given.pop("width", 16)}
+    policy = {"name": "d_optimal", **given.pop("policy", {})}
+    env = {"name": "cartpole", "horizon": 12} | given
+    mapping = TrialSpec.from_names(env, policy, model=model).to_mapping()
+    check_one_by_one([TrialSpec.from_mapping(mapping | {"seed": seed}) for seed in range(3)])
+
+
+def check_one_by_one(specs: list[TrialSpec]) -> None:
     together = run_trials(specs)
     for spec, many in zip(specs[1:], together[1:], strict=True):
         one = run_trials([spec])[0]
