@@ -471,7 +471,8 @@ class NetworkSteps(BatchSteps):
         return torch.from_numpy(np.array(self._features(tuple(x))))
 
     def _known(self, x: Array, u: Array) -> Array:
-        return np.array(self.system.known(tuple(x), tuple(u), self.system.parameters))
+        known = self.system.known(tuple(x), tuple(u), self.system.parameters)
+        return np.array(known, dtype=np.result_type(x, u))  # some may be whole numbers
 
     def _accelerations(self, x: Array) -> Array:
         return self._network.value(self.theta[0], self._point(x)).numpy()
