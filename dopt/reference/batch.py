@@ -489,8 +489,9 @@ class NetworkSteps(BatchSteps):
         return following
 
     def learn(self, t: int) -> None:
-        """Update the parameters with the samples up to step t."""
-        self.learner.learn(t)
+        """Update the parameters with the samples up to step t, unless the trial has diverged."""
+        if not self.diverged.item():
+            self.learner.learn(t)
 
     def observe(self, t: int, dt: float) -> None:
         """Store the accelerations observed in step t, as a batch does."""
