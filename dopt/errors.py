@@ -69,11 +69,11 @@ def suggestion(given: str, valid: Iterable[str]) -> str:
 def _similarity(given: str, name: str) -> tuple[float, float]:
     """Return how similar two names are at best, and as a whole, from 0 to 1.
 
-    Of names in folders, such as ``beyond/exact``, the last parts are compared too: the folder may
-    be missing, or another one.
+    Of names in folders or sections, such as ``beyond/exact`` or ``env.gamma``, the last parts are
+    compared too: the folder may be missing, or another one.
     """
     whole = SequenceMatcher(None, name, given).ratio()
-    last = SequenceMatcher(None, name.rpartition("/")[2], given.rpartition("/")[2]).ratio()
+    last = SequenceMatcher(None, re.split("[/.]", name)[-1], re.split("[/.]", given)[-1]).ratio()
     return max(whole, last), whole
 
 

@@ -298,7 +298,7 @@ class TrialRow(Outcome):
     trial_key: str
     status: str
     attempt: int
-    launch: int | None
+    launch_id: int | None
     error_type: str | None
     error_message: str | None
 

@@ -275,9 +275,13 @@ def read_engine(url: URL) -> Engine:
 
 
 def existing_path(url: URL) -> Path:
-    """Return the path of a database; raise ``NoDatabaseError`` if there is no file."""
+    """Return the path of a database.
+
+    Raises ``NoDatabaseError`` if there is nothing, ``StoreError`` for what is no file.
+    """
     path = sqlite_path(url)
     with translated_file(public_url(url)):
+        _refuse_others(path, public_url(url))
         there = path.is_file()
     if not there:
         raise NoDatabaseError(
@@ -285,6 +289,20 @@ def existing_path(url: URL) -> Path:
             "it, or give the URL of another one (--db, or the variable DOPT_DB)."
         )
     return path
+
+
+def _refuse_others(path: Path, url: str) -> None:
+    """Refuse what is there and is no file."""
+    if path.is_dir():
+        raise StoreError(
+            f"The results database {url} is a folder, but a file is expected: give one in it, such "
+            f"as sqlite:///{path / 'results.db'}."
+        )
+    if path.exists() and not path.is_file():
+        raise StoreError(
+            f"The results database {url} is a device, a pipe or a socket, but a file is expected: "
+            "give another path."
+        )
 
 
 def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience: float) -> Engine:
@@ -435,16 +453,7 @@ class SQLiteBackend(Backend):
         super().__init__(engine, public_url(url))
         refuse_unsafe(self._path, self.safe_url)
         with translated_file(self.safe_url):
-            if self._path.is_dir():
-                raise StoreError(
-                    f"The results database {self.safe_url} is a folder, but a file is expected: "
-                    f"give one in it, such as sqlite:///{self._path / 'results.db'}."
-                )
-            if self._path.exists() and not self._path.is_file():
-                raise StoreError(
-                    f"The results database {self.safe_url} is a device, a pipe or a socket, but a "
-                    "file is expected: give another path."
-                )
+            _refuse_others(self._path, self.safe_url)
             self._folder.mkdir(parents=True, exist_ok=True)
         self._locks = LaunchLocks(self._folder)
 
