@@ -26,7 +26,7 @@ from analysis.stats.curves import PlotOptions
 from analysis.style import counted
 from analysis.tables.rendering import TABLES
 from dopt import __version__
-from orchestrate.files import make_folder, whole
+from orchestrate.errors import make_folder, whole
 from orchestrate.program import COMMIT_VARIABLE, commit_of, git
 from orchestrate.store import Reader
 

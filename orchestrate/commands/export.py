@@ -17,8 +17,7 @@ from dopt.errors import DoptError
 from dopt.types import Array
 from orchestrate.commands import Command, add_filters, answer, chosen
 from orchestrate.commands.results import counts
-from orchestrate.errors import ExitCode
-from orchestrate.files import whole
+from orchestrate.errors import ExitCode, whole
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory, public
 from orchestrate.store.records import now, unpacked_trajectory

@@ -22,8 +22,7 @@ from typing import Literal
 from sqlalchemy import Connection, bindparam, select, text, update
 
 from dopt.spec.config import REGISTRIES, config_label, section_class
-from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
-from orchestrate.files import whole
+from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError, whole
 from orchestrate.store import launches, records, schema, sqlite
 from orchestrate.store.backend import (
     Backend,
