@@ -1,4 +1,4 @@
-"""Commands on a running grid, ``status`` and ``work``, and on a database, ``merge`` to ``prune``."""
+"""Commands on a grid, ``status`` and ``work``, and on a database: ``merge`` to ``prune``."""
 
 from __future__ import annotations
 
