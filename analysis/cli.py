@@ -214,9 +214,9 @@ def _figures(options: argparse.Namespace) -> int:
     asked = _plot_options(options), options.out, tuple(options.only or NAMES)
     empty = 0
     with _selected(options) as (reader, selection):
-        for outcome in build(reader, selection, *asked, force=options.force):
-            tell(sys.stdout, f"{options.out / outcome.name}: {outcome.state}\n")
-            empty += bool(options.only) and outcome.state.startswith("not drawn")
+        for name, state in build(reader, selection, *asked, force=options.force):
+            tell(sys.stdout, f"{options.out / name}: {state}\n")
+            empty += bool(options.only) and state.startswith("not drawn")
     return 1 if empty else 0
 
 

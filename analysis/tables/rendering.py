@@ -121,6 +121,9 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 Text = Callable[[Row], str]
 
+_NAMED: Columns = (("env", itemgetter("env")), ("variant", itemgetter("label")))
+"""Columns that name a configuration."""
+
 
 def text_of(column: str, words: Callable[[Any], str]) -> Text:
     """Return a function that writes one column of a row."""
@@ -163,8 +166,7 @@ def sample_loss_columns(stored: bool) -> Columns:
 def summary_table(table: pd.DataFrame) -> TextTable:
     """Return the table of final losses: mean ± 2 SE, median, IQM and n."""
     columns: Columns = (
-        ("env", itemgetter("env")),
-        ("variant", itemgetter("label")),
+        *_NAMED,
         ("final loss", mean_text("loss")),
         ("median", text_of("loss_median", number)),
         ("IQM", text_of("loss_iqm", number)),
@@ -379,8 +381,7 @@ def calibration_table(table: pd.DataFrame) -> TextTable:
         ("log loss", "log_loss", number),
     )
     columns: Columns = (
-        ("env", itemgetter("env")),
-        ("variant", itemgetter("label")),
+        *_NAMED,
         *(
             (f"{title}, {kind}", text_of(f"{kind}_{name}", text))
             for title, name, text in measures
@@ -489,8 +490,7 @@ def _row(entry: Entry, samples: Mapping[int, float]) -> dict[str, object]:
 def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
     """Return the table; ``say`` is told what is left out, and ``keep`` gets what was fitted."""
     columns: Columns = (
-        ("env", itemgetter("env")),
-        ("variant", itemgetter("label")),
+        *_NAMED,
         *((f"{title} [95 %]", _mean_text(name)) for name, title in _MEANS.items()),
         ("n", itemgetter("n")),
     )

@@ -16,7 +16,7 @@ from rich.text import Text
 from dopt.errors import given_path
 from orchestrate.commands import Command, add_filters, answer, chosen, plain, say, say_json, show
 from orchestrate.commands.results import (
-    STATES,
+    MAX_KINDS,
     ListedTrial,
     Status,
     gather,
@@ -42,7 +42,7 @@ from orchestrate.store.maintenance import (
     upgrade,
 )
 from orchestrate.store.merge import Merged, TrialName, merge
-from orchestrate.store.records import utc_text
+from orchestrate.store.records import STATES, utc_text
 
 MAX_ROWS = 60
 """Rows of the table without --all."""
@@ -78,7 +78,6 @@ _NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt"
 _CONFIG = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
 _LAUNCH = ("launch_id", "alive", "host", "pid", "started", "argv")
 _FAILURE = ("cause", "type", "message", "trials", "attempts", "last_line", "place")
-_MAX_KINDS = 10
 _MAX_EXPLORATIONS = 20  # the newest
 _MAX_PLACES = 4
 _MAX_LINE = 200  # characters of a line of a traceback
@@ -113,9 +112,9 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
             yield plain(f"  {one.trial_key[:12]}  {name}: {one.state}")
     if status.failures:
         yield Text("\nFailures", style="bold red")
-        yield from map(_failure, status.failures[:_MAX_KINDS])
-        if len(status.failures) > _MAX_KINDS:
-            yield Text(f"  and {len(status.failures) - _MAX_KINDS:,} other kinds")
+        yield from map(_failure, status.failures[:MAX_KINDS])
+        if len(status.failures) > MAX_KINDS:
+            yield Text(f"  and {len(status.failures) - MAX_KINDS:,} other kinds")
     detached = status.detached if status.left else ()
     if status.launches or detached:
         yield Text("\nLaunches", style="bold")

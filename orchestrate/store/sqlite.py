@@ -480,7 +480,7 @@ class SQLiteBackend(Backend):
 
     def _files(self) -> list[tuple[int, int] | None]:
         """Return the identities of the file that the URL names and of the logs in use."""
-        return [_identity(self._given), *(_identity(Path(f"{self._path}{s}")) for s in _LOGS)]
+        return [identity(self._given), *(identity(Path(f"{self._path}{s}")) for s in _LOGS)]
 
     def check(self, written: bool = False) -> None:
         with self._checking:
@@ -573,12 +573,12 @@ class SQLiteBackend(Backend):
             failures = suppress(SQLAlchemyError, sqlite3.Error, StoreError)
             with failures, self.engine.connect() as connection:
                 driver_of(connection).execute(_TRUNCATE)
-        if log and self._saved and self._opened[0] != _identity(self._path):
+        if log and self._saved and self._opened[0] != identity(self._path):
             with suppress(OSError):  # no connection of the pool was left
                 os.truncate(f"{self._path}-wal", 0)
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def identity(path: Path) -> tuple[int, int] | None:
     """Return device and inode of a file, or None without a file."""
     try:
         found = path.stat()
@@ -587,11 +587,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _place(identity: tuple[int, int] | None) -> str:
+def _place(wanted: tuple[int, int] | None) -> str:
     """Return the present path of an open file; empty if it was deleted, or is not known."""
     with suppress(OSError):
         for link in Path("/proc/self/fd").iterdir():
-            if _identity(link) == identity and not str(link.readlink()).endswith(" (deleted)"):
+            if identity(link) == wanted and not str(link.readlink()).endswith(" (deleted)"):
                 return str(link.readlink())
     return ""
 
