@@ -23,7 +23,6 @@ from analysis.outputs import NAMES, build, partial_warning
 from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread, Statistic, median_seed
 from analysis.stats.scores import Measure
-from analysis.style import counted
 from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
@@ -35,7 +34,7 @@ from analysis.tables.rendering import (
     incomplete,
     sample_loss_kind,
 )
-from dopt.errors import install_command
+from dopt.errors import counted, install_command
 from dopt.result import Assessment
 from orchestrate.program import Parser, answered, folder, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, Store, default_url

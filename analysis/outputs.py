@@ -23,9 +23,9 @@ import pandas as pd
 
 from analysis.data.selection import Gap, Selection
 from analysis.stats.curves import PlotOptions
-from analysis.style import counted
 from analysis.tables.rendering import TABLES
 from dopt import __version__
+from dopt.errors import counted
 from orchestrate.errors import make_folder, whole
 from orchestrate.program import COMMIT_VARIABLE, commit_of, git
 from orchestrate.store import Reader

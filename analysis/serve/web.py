@@ -222,8 +222,10 @@ class Database:
 
     def _file(self) -> Identity:
         """Return device and inode of the database file; None without one or on PostgreSQL."""
-        found = self._path and identity(self._path)
-        if self._path and not found:
+        if self._path is None:
+            return None
+        found = identity(self._path)
+        if found is None:
             self.close()
         return found
 

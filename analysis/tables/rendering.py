@@ -20,7 +20,6 @@ from analysis.stats.curves import STUDENT_RANGE, PlotOptions
 from analysis.stats.scores import Measure, geometric_mean
 from analysis.style import (
     but_diverged,
-    counted,
     number,
     p_text,
     plus_minus,
@@ -36,7 +35,7 @@ from analysis.tables.comparisons import (
     summarise,
 )
 from dopt.assessment import SAMPLE_LOSS
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, counted
 from dopt.offline_fit import HeldOutFit, held_out_fit, sample_loss
 from dopt.result import Assessment
 from orchestrate.store import QueryError, Reader

@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
-from dopt.errors import given_path
+from dopt.errors import counted, given_path
 from orchestrate.commands import Command, add_filters, answer, chosen, plain, say, say_json, show
 from orchestrate.commands.results import (
     MAX_KINDS,
@@ -101,7 +101,7 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
     yield Text(f"\n{summary(status)}", style="bold")
     if status.mixed:
         yield Text(
-            f"{_plural(len(status.mixed), 'configuration')} with results of different code "
+            f"{counted(len(status.mixed), 'configuration')} with results of different code "
             f"(the first is {status.mixed[0][:12]}): python -m orchestrate doctor",
             style="yellow",
         )
@@ -130,7 +130,7 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
 def _failure(kind: FailureKind) -> Text:
     places = sorted(f"{env}/{policy}" for env, policy in kind.places)
     more = [f"and {len(places) - _MAX_PLACES} other places"] if len(places) > _MAX_PLACES else []
-    text = Text(f"  {_plural(kind.trials, 'trial')} ({_plural(kind.attempts, 'attempt')}), ")
+    text = Text(f"  {counted(kind.trials, 'trial')} ({counted(kind.attempts, 'attempt')}), ")
     text.append(kind.cause, style="red")
     text.append(f": {', '.join([*places[:_MAX_PLACES], *more])}")
     last = kind.last_line or f"{kind.type or ''}: {kind.message or ''}".strip(": ")
@@ -175,10 +175,6 @@ def document(status: Status, database: str) -> dict[str, Any]:
         "explorations": [asdict(one) for one in status.explorations],
         "mixed_code": list(status.mixed),
     }
-
-
-def _plural(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def _first_line(text: str) -> str:
@@ -267,7 +263,8 @@ def _merge(url: str, other: str) -> Merged:
 
 def _merge_lines(merged: Merged) -> list[str]:
     added = ", ".join(f"{count:,} {status}" for status, count in sorted(merged.added.items()))
-    lines = [f"copied {sum(merged.added.values()):,} trials{f' ({added})' if added else ''}"]
+    copied = counted(sum(merged.added.values()), "trial")
+    lines = [f"copied {copied}{f' ({added})' if added else ''}"]
     told = {
         f"{merged.identical:,} exist here with equal numbers": merged.identical,
         f"{merged.kept:,} failed there and have an outcome here": merged.kept,
