@@ -23,7 +23,6 @@ from analysis.outputs import NAMES, build, partial_warning
 from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread, Statistic, median_seed
 from analysis.stats.scores import Measure
-from analysis.style import counted
 from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
@@ -35,7 +34,7 @@ from analysis.tables.rendering import (
     incomplete,
     sample_loss_kind,
 )
-from dopt.errors import install_command
+from dopt.errors import counted, install_command
 from dopt.result import Assessment
 from orchestrate.program import Parser, answered, folder, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, Store, default_url
@@ -214,9 +213,9 @@ def _figures(options: argparse.Namespace) -> int:
     asked = _plot_options(options), options.out, tuple(options.only or NAMES)
     empty = 0
     with _selected(options) as (reader, selection):
-        for outcome in build(reader, selection, *asked, force=options.force):
-            tell(sys.stdout, f"{options.out / outcome.name}: {outcome.state}\n")
-            empty += bool(options.only) and outcome.state.startswith("not drawn")
+        for name, state in build(reader, selection, *asked, force=options.force):
+            tell(sys.stdout, f"{options.out / name}: {state}\n")
+            empty += bool(options.only) and state.startswith("not drawn")
     return 1 if empty else 0
 
 

@@ -22,7 +22,7 @@ from dopt.run import rerun
 from dopt.spec.trial import TrialSpec
 from dopt.systems import Arm, Cartpole, Chain, Quadrotor, System
 from dopt.types import Array, Integers
-from orchestrate.files import whole
+from orchestrate.errors import whole
 from orchestrate.store import Reader
 
 Move = Callable[[int, int], object]  # puts a panel into the state of a frame and step

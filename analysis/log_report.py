@@ -22,9 +22,9 @@ import pandas as pd
 from analysis.data.matching import AnalysisError
 from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
-from dopt.errors import given_path, install_command
+from dopt.errors import counted, given_path, install_command
 from dopt.log import Log
-from dopt.log_columns import TURN, UNIT_OF_ANGLE, clock_unit, count_text
+from dopt.log_columns import TURN, UNIT_OF_ANGLE, clock_unit
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
@@ -391,7 +391,7 @@ def _sampling(log: Log, health: Health, told: bool) -> str:
         text = f"every {steps[0]}"
     if health.irregular > 0:
         text += f", {100 * health.irregular:.2g} % of the steps off by more than 20 %"
-    text += f", {len(log.pieces)} piece{'s' * (len(log.pieces) > 1)} without gaps"
+    text += f", {counted(len(log.pieces), 'piece')} without gaps"
     if health.step >= 1 and not told:
         likely = "ms" if health.step < 1e3 else "us" if health.step < 1e6 else "ns"
         text += f"; stamps in {likely}? A step of {number(health.step)} s is long: "
@@ -412,7 +412,7 @@ def _unit(given: str | None) -> str:
 def _signal(one: Signal) -> str:
     text = f"{number(one.low)} to {number(one.high)}"
     if one.levels < FEW:
-        return f"{text}, {one.levels} level{'s' * (one.levels > 1)}"
+        return f"{text}, {counted(one.levels, 'level')}"
     if math.isnan(one.quantum):
         return f"{text}, no steps"
     turn = TURN / one.quantum
@@ -434,7 +434,7 @@ def _units(one: Signal, declared: bool) -> Iterator[str]:
     if one.alone is not None:
         value, rows = one.alone
         yield (
-            f"{one.name}: {value:g} in {count_text(rows, 'row')}, far from all others: not "
+            f"{one.name}: {value:g} in {counted(rows, 'row')}, far from all others: not "
             f"measured there? Leave such values empty"
         )
     span = one.high - one.low

@@ -23,10 +23,10 @@ import pandas as pd
 
 from analysis.data.selection import Gap, Selection
 from analysis.stats.curves import PlotOptions
-from analysis.style import counted
 from analysis.tables.rendering import TABLES
 from dopt import __version__
-from orchestrate.files import make_folder, whole
+from dopt.errors import counted
+from orchestrate.errors import make_folder, whole
 from orchestrate.program import COMMIT_VARIABLE, commit_of, git
 from orchestrate.store import Reader
 
@@ -71,14 +71,6 @@ def plots() -> dict[str, Plot[Any]]:
     return found
 
 
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """Result of one output: drawn, unchanged, or nothing stored for it."""
-
-    name: str
-    state: str
-
-
 def build(
     reader: Reader,
     selection: Selection,
@@ -87,14 +79,14 @@ def build(
     names: tuple[str, ...] = NAMES,
     *,
     force: bool = False,
-) -> Iterator[Outcome]:
-    """Write the named outputs and the page of all into a folder; say of each what happened."""
+) -> Iterator[tuple[str, str]]:
+    """Write the named outputs and the page of all into a folder; yield names and what happened."""
     make_folder(folder)
     for name in names:
         part = selection if name in WITH_EXPLORATIONS else selection.simulated()
-        yield Outcome(name, _made(reader, part, options, folder, name, force=force))
+        yield name, _made(reader, part, options, folder, name, force=force)
     if write_page(folder, (*TABLES, *FIGURES)):
-        yield Outcome(PAGE, "written")
+        yield PAGE, "written"
 
 
 def _made(

@@ -51,7 +51,7 @@ from analysis.tables.variants import (
     verdict,
 )
 from dopt.policies import POLICIES
-from orchestrate.files import make_folder
+from orchestrate.errors import make_folder
 from orchestrate.store import Reader
 
 HELP = "compare every policy, model and learner with the reference, on one page"

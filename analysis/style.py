@@ -167,11 +167,6 @@ def but_diverged(count: int, diverged: int) -> str:
     return f"{count}, {diverged} diverged" if diverged else str(count)
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number of things, such as ``1 trial`` or ``2 trials``."""
-    return f"{count:,} {noun}{'s' * (count != 1)}"
-
-
 def count_text(counts: Mapping[str, str]) -> str:
     """Return the counts by policy as a text: the commonest one, then those that differ from it.
 

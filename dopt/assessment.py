@@ -48,7 +48,9 @@ def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
     Forecasts by networks and by the linear form of physics run in compiled code.
     """
     if not (system.compiled and model.compiled and isinstance(model, (MLP, Linear))):
-        return forecast_by(system, lambda x, u: model.predict(system, parameters, x, u))
+        return forecast_by(
+            system, lambda x, u: model.predict_at(system, parameters, model.points(system, x, u))
+        )
     from dopt.kernel import run
 
     return run.model_forecast(system, model, parameters)

@@ -57,6 +57,11 @@ def unknown_name(kind: str, given: object, valid: Iterable[str]) -> Specificatio
     return SpecificationError(f"{kind} '{given}' is unknown: {suggestion(str(given), names)}")
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number of things, such as ``1 trial`` or ``2,000 trials``."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def suggestion(given: str, valid: Iterable[str]) -> str:
     """Return what to write in place of a name: the nearest one, if one is similar, then all."""
     names = list(valid)
@@ -69,11 +74,12 @@ def suggestion(given: str, valid: Iterable[str]) -> str:
 def _similarity(given: str, name: str) -> tuple[float, float]:
     """Return how similar two names are at best, and as a whole, from 0 to 1.
 
-    Of names in folders, such as ``beyond/exact``, the last parts are compared too: the folder may
-    be missing, or another one.
+    Of names in folders or sections, such as ``beyond/exact`` or ``env.gamma``, the last parts are
+    compared too: the folder may be missing, or another one.
     """
+    name, given = name.lstrip("-"), given.lstrip("-")
     whole = SequenceMatcher(None, name, given).ratio()
-    last = SequenceMatcher(None, name.rpartition("/")[2], given.rpartition("/")[2]).ratio()
+    last = SequenceMatcher(None, re.split("[/.]", name)[-1], re.split("[/.]", given)[-1]).ratio()
     return max(whole, last), whole
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
-from dopt.errors import SpecificationError, suggestion, unknown_name
+from dopt.errors import SpecificationError, counted, suggestion, unknown_name
 from dopt.log_columns import (
     GAP,
     TURN,
@@ -23,7 +23,6 @@ from dopt.log_columns import (
     clock_unit,
     columns_of,
     continued,
-    count_text,
     rows_text,
     stamps_of,
     values_of,
@@ -256,7 +255,7 @@ class Log:
     def __repr__(self) -> str:
         duration = sum(float(piece.time[-1] - piece.time[0]) for piece in self.pieces)
         return (
-            f"Log({self.n_rows:,} rows, {count_text(len(self.pieces), 'piece')}, {duration:g} s, "
+            f"Log({self.n_rows:,} rows, {counted(len(self.pieces), 'piece')}, {duration:g} s, "
             f"states {', '.join(self.states)}, inputs {', '.join(self.inputs)})"
         )
 
@@ -364,7 +363,7 @@ def _unwrapped(name: str, angle: Array, pieces: Rows, notes: list[str]) -> Array
     if passes:
         notes.append(
             f"Angle {name!r} is measured within one turn and passes its end "
-            f"{count_text(passes, 'time')}: unwrapped."
+            f"{counted(passes, 'time')}: unwrapped."
         )
     return found
 
@@ -376,7 +375,7 @@ def _leave_out(name: str, y: Array, pieces: Rows, period: float, notes: list[str
     rows = np.concatenate([*found, np.empty(0, np.intp)])
     if not 0 < len(rows) <= MOST_OUTLIERS * len(y):
         return rows[:0]
-    notes.append(f"{count_text(len(rows), 'outlier')} of {name} left out, first row {rows[0]}.")
+    notes.append(f"{counted(len(rows), 'outlier')} of {name} left out, first row {rows[0]}.")
     y[rows] = np.nan
     return rows
 
@@ -416,6 +415,4 @@ def _note_missing(names: Sequence[str], measured: Array, notes: list[str]) -> No
                 f"expected: leave it out of 'states', then a fit estimates it."
             )
         if lost:
-            notes.append(
-                f"State {name!r} is missing in {count_text(lost, 'row')}: it stays missing."
-            )
+            notes.append(f"State {name!r} is missing in {counted(lost, 'row')}: it stays missing.")

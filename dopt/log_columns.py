@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dopt.errors import SpecificationError, unknown_name
+from dopt.errors import SpecificationError, counted, unknown_name
 from dopt.types import Array
 
 GAP = 10.0
@@ -203,7 +203,7 @@ def values_of(
             if jumps:
                 notes.append(
                     f"The counter of {bits} bits in column {name!r} begins again "
-                    f"{count_text(jumps, 'time')}: it goes on."
+                    f"{counted(jumps, 'time')}: it goes on."
                 )
                 found = continued(found, 2.0**bits)
     return found * factor
@@ -313,7 +313,3 @@ def _going_on(seconds: Array, periods: Sequence[float], notes: list[str]) -> Arr
 def rows_text(rows: npt.NDArray[np.intp]) -> str:
     """Return how many rows and which is the first: ``3 rows, first row 17``."""
     return f"row {rows[0]}" if len(rows) == 1 else f"{len(rows):,} rows, first row {rows[0]}"
-
-
-def count_text(number: int, what: str) -> str:
-    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"

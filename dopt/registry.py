@@ -165,7 +165,7 @@ def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any)
         raise _unfit(section, path, f"a class with {', '.join(unlike)}")
     name = own.__dict__.get("name")
     if not isinstance(name, str) or name in registry:
-        raise _unfit(section, path, "a class with a 'name' of its own, which no other has")
+        raise _unfit(section, path, "a class with a 'name' of its own, which no other has,")
     return own
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import numpy as np
-import numpy.typing as npt
 
+from dopt.arguments import whole
 from dopt.systems.base import System
-
-Array = npt.NDArray[np.float64]
+from dopt.types import Array
 
 
 class TrialView(ABC):
@@ -88,6 +87,7 @@ class TrialView(ABC):
 
     def held(self, inputs: Array, steps: int) -> Array:
         """Return the predicted states, (N, d), after steps in which each input, (N, m), is held."""
+        steps = whole("the number of steps for which an input is held", steps, 1)
         states = self.following(self.states[-1], inputs)
         for _ in range(steps - 1):
             following = (self.following(x, u[None]) for x, u in zip(states, inputs, strict=True))

@@ -16,12 +16,12 @@ if __name__ == "__main__":
     run("orchestrate.__main__")  # what cannot be imported is answered, too
 
 from dopt.errors import unknown_name
-from orchestrate.commands import PROGRAM, Command, design, export, maintenance, results, say, status
+from orchestrate.commands import PROGRAM, Command, design, export, maintenance, results, say
 from orchestrate.errors import ExitCode
 
 COMMANDS: tuple[Command, ...] = (
-    status.WORK_COMMAND,
-    status.STATUS_COMMAND,
+    maintenance.WORK_COMMAND,
+    maintenance.STATUS_COMMAND,
     results.SHOW_COMMAND,
     maintenance.RETRY_COMMAND,
     results.QUERY_COMMAND,

@@ -221,11 +221,18 @@ def path(option: str) -> Callable[[str], Path]:
     return partial(given_path, what=option, refusal=UsageError)
 
 
+_FILES = (
+    *(".csv", ".gif", ".html", ".json", ".md", ".npz"),
+    *(".parquet", ".pdf", ".png", ".svg", ".tex", ".txt"),
+)
+"""Endings of files, which name no folder."""
+
+
 def folder(option: str) -> Callable[[str], Path]:
     """Return the argument type for the path of a folder, which is not named like a file."""
 
     def read(given: str) -> Path:
-        if given.endswith((".csv", ".html", ".npz", ".pdf", ".png", ".svg")):
+        if given.endswith(_FILES):
             raise UsageError(f"{option} is {given!r}, but a folder is expected: give one.")
         return path(option)(given)
 

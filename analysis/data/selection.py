@@ -20,8 +20,7 @@ from analysis.data.matching import (
     setting_value,
     source_notes,
 )
-from analysis.style import counted
-from dopt.errors import IncompatibleError, SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError, counted
 from dopt.policies import POLICIES, TITLES
 from dopt.spec.config import SECTIONS, labels, limits_label, value_label
 from dopt.spec.trial import is_prequential, stored_trial

@@ -27,7 +27,7 @@ from analysis.style import BLUE, GREY, SEQUENCE, VERMILLION
 from analysis.tables.rendering import records
 from analysis.tables.variants import verdict
 from dopt.log import Log
-from orchestrate.files import whole
+from orchestrate.errors import whole
 
 if TYPE_CHECKING:
     from dopt.fitting.fitted import Fitted

@@ -38,6 +38,7 @@ from dopt.systems import System
 from dopt.systems.properties import eigenmode
 from dopt.types import Array
 from orchestrate.store import ConfigRow, LaunchRow, QueryError, Reader, failure_kinds, trial_report
+from orchestrate.store.records import STATES
 
 Content = dict[str, Any]
 
@@ -51,7 +52,6 @@ WINDOW = 25
 RUNNING = f"running median of {WINDOW} steps"
 LOSSES = ("loss", "reachable_loss")
 
-STATUSES = ("done", "diverged", "failed", "cancelled", "running", "pending")
 COLUMNS = {
     "env": "environment",
     "policy": "policy and settings",
@@ -218,13 +218,12 @@ def _rows(
 
 
 def _tile(config: ConfigRow, losses: Array, samples: Array) -> Content:
-    counts = {status: int(getattr(config, f"n_{status}")) for status in STATUSES}
     return {
         "config_key": config.config_key,
         "policy": config.policy,
         "n": config.n,
         "ended": config.n - config.n_pending - config.n_running,
-        "counts": {status: count for status, count in counts.items() if count},
+        "counts": {state: count for state, count in config.counts.items() if count},
         **mean_columns("loss", losses),
         **(mean_columns("sample_loss", samples) if len(samples) else {}),
         "n_used": len(losses),
@@ -364,7 +363,7 @@ def trials(state: ServerState, params: QueryParams) -> Content:
     given = {
         "env": params.choice("env", environments),
         "policy": params.choice("policy", policies),
-        "status": params.choice("status", STATUSES),
+        "status": params.choice("status", STATES),
         "config_key": params.text("config"),
         "width": params.integer("width", low=1),
         "seed": params.integer("seed", high=2**63 - 1),
@@ -397,7 +396,7 @@ def trials(state: ServerState, params: QueryParams) -> Content:
             "env": environments,
             "policy": {name: policy_style(name).label for name in policies},
             "width": _widths(configs),
-            "status": STATUSES,
+            "status": STATES,
         },
     }
 

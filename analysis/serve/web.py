@@ -31,6 +31,7 @@ from dopt.errors import DoptError, suggestion
 from orchestrate.store import Reader
 from orchestrate.store.backend import parse_url, public_url, read_login, sqlite_path
 from orchestrate.store.records import jsonable
+from orchestrate.store.sqlite import identity
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -195,10 +196,10 @@ class Database:
         parsed = parse_url(url)
         self.safe_url = public_url(parsed)
         self._url = url
-        self.is_file = parsed.get_backend_name() != "postgresql"
         self.user = parsed.username
         self.read_login = read_login(parsed)
-        self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
+        self.is_file = parsed.get_backend_name() == "sqlite"
+        self._path = sqlite_path(parsed) if self.is_file else None
         self._lock = threading.Lock()
         self._reader: Reader | None = None
         self._identity: Identity = None
@@ -223,12 +224,10 @@ class Database:
         """Return device and inode of the database file; None without one or on PostgreSQL."""
         if self._path is None:
             return None
-        try:
-            found = self._path.stat()
-        except OSError:
+        found = identity(self._path)
+        if found is None:
             self.close()
-            return None
-        return found.st_dev, found.st_ino
+        return found
 
 
 class Cache:

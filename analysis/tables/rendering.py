@@ -20,7 +20,6 @@ from analysis.stats.curves import STUDENT_RANGE, PlotOptions
 from analysis.stats.scores import Measure, geometric_mean
 from analysis.style import (
     but_diverged,
-    counted,
     number,
     p_text,
     plus_minus,
@@ -36,7 +35,7 @@ from analysis.tables.comparisons import (
     summarise,
 )
 from dopt.assessment import SAMPLE_LOSS
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, counted
 from dopt.offline_fit import HeldOutFit, held_out_fit, sample_loss
 from dopt.result import Assessment
 from orchestrate.store import QueryError, Reader
@@ -121,6 +120,9 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 Text = Callable[[Row], str]
 
+_NAMED: Columns = (("env", itemgetter("env")), ("variant", itemgetter("label")))
+"""Columns that name a configuration."""
+
 
 def text_of(column: str, words: Callable[[Any], str]) -> Text:
     """Return a function that writes one column of a row."""
@@ -163,8 +165,7 @@ def sample_loss_columns(stored: bool) -> Columns:
 def summary_table(table: pd.DataFrame) -> TextTable:
     """Return the table of final losses: mean ± 2 SE, median, IQM and n."""
     columns: Columns = (
-        ("env", itemgetter("env")),
-        ("variant", itemgetter("label")),
+        *_NAMED,
         ("final loss", mean_text("loss")),
         ("median", text_of("loss_median", number)),
         ("IQM", text_of("loss_iqm", number)),
@@ -379,8 +380,7 @@ def calibration_table(table: pd.DataFrame) -> TextTable:
         ("log loss", "log_loss", number),
     )
     columns: Columns = (
-        ("env", itemgetter("env")),
-        ("variant", itemgetter("label")),
+        *_NAMED,
         *(
             (f"{title}, {kind}", text_of(f"{kind}_{name}", text))
             for title, name, text in measures
@@ -489,8 +489,7 @@ def _row(entry: Entry, samples: Mapping[int, float]) -> dict[str, object]:
 def sample_loss_kind(say: Callable[[str], object], keep: Keep) -> TableKind:
     """Return the table; ``say`` is told what is left out, and ``keep`` gets what was fitted."""
     columns: Columns = (
-        ("env", itemgetter("env")),
-        ("variant", itemgetter("label")),
+        *_NAMED,
         *((f"{title} [95 %]", _mean_text(name)) for name, title in _MEANS.items()),
         ("n", itemgetter("n")),
     )

@@ -49,9 +49,10 @@ from analysis.stats.scores import (
     usable,
     without_ratio,
 )
-from analysis.style import but_diverged, counted
+from analysis.style import but_diverged
 from analysis.tables.comparisons import against_reference, loss_of_random_inputs, paired
 from dopt.assessment import Plane
+from dopt.errors import counted
 from dopt.policies import policy_title
 from dopt.spec.config import difference
 from dopt.spec.trial import is_prequential, system_of

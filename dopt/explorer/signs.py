@@ -25,9 +25,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from dopt.control.planning import predict, relative_error
+from dopt.errors import counted
 from dopt.explorer.journal import Event
 from dopt.learning import SimulationError
-from dopt.log_columns import count_text
 from dopt.models.gaussian_process import GaussianProcess
 from dopt.spec.scaled import scaled
 from dopt.spec.trial import TrialSpec
@@ -344,7 +344,7 @@ class Signs:
         if largest >= EXPLAINED:
             sign, samples = said
             state.counts[sign] += 1
-            self._say(sign, count_text(samples, "sample"), 100.0 * largest)
+            self._say(sign, counted(samples, "sample"), 100.0 * largest)
 
     def _measure_box(self, state: Exploration) -> None:
         """Count the sides of the box of which the states so far cover little."""

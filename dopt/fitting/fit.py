@@ -31,7 +31,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from dopt.arguments import instance, whole
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, counted
 from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of
 from dopt.fitting.problem import (
@@ -51,7 +51,6 @@ from dopt.fitting.problem import (
 )
 from dopt.fitting.simulation import Data
 from dopt.log import Log
-from dopt.log_columns import count_text
 from dopt.systems.plant import Plant, Unknown, first_guess
 from dopt.types import Array, Integers
 
@@ -164,8 +163,7 @@ def fit(
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
     work.outliers = sum((run.outliers for run in runs), work.outliers)
     work.notes += [
-        f"{count_text(number, 'outlier')} of {name} left out"
-        for name, number in work.outliers.items()
+        f"{counted(number, 'outlier')} of {name} left out" for name, number in work.outliers.items()
     ]
     lengths = work.lengths(window)
     work.scan_delay(lengths[0])

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, counted
 from dopt.fitting.model import Model, data_of, measured_names
 from dopt.fitting.problem import (
     FEWEST,
@@ -34,7 +34,6 @@ from dopt.fitting.problem import (
 )
 from dopt.fitting.simulation import Data
 from dopt.log import Log
-from dopt.log_columns import count_text
 from dopt.systems.plant import Plant, Unknown
 from dopt.types import Array, Integers
 
@@ -352,7 +351,7 @@ class Fitted:
             return "Not judged: no run is long enough, or moves beyond its noise, to be predicted."
         enough = {horizon: count for horizon, (count, _) in judged.items() if count >= FEWEST}
         if not enough:
-            most = count_text(max(count for count, _ in judged.values()), "prediction")
+            most = counted(max(count for count, _ in judged.values()), "prediction")
             return f"Not judged: {most} at most, but {FEWEST} are expected: give longer runs."
         if not useful:
             return "Do not use this model: it predicts no better than that nothing changes."
@@ -403,7 +402,7 @@ class Fitted:
                 models = ", ".join(f"{row['model']} {row['rms']:.3g}" for row in here)
                 best = next(row for row in here if row["model"] == "model")
                 lines.append(
-                    f"    {horizon:.3g} s, {count_text(best['windows'], 'prediction')}: {models}, "
+                    f"    {horizon:.3g} s, {counted(best['windows'], 'prediction')}: {models}, "
                     f"nothing changes {best['nothing_changes']:.3g}; median of the model "
                     f"{best['median']:.3g}"
                 )

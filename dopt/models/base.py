@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from dopt.arguments import numbers, rows_of
 from dopt.fields import KernelSupport, parameter
 from dopt.systems.base import Feature, System, feature_values, with_inputs
 from dopt.types import Array
@@ -55,9 +56,13 @@ class Model(KernelSupport):
     ) -> Array:
         """Return the modelled accelerations, (N, r), of states, (N, d), with parameters (q,).
 
-        The inputs, (N, m), count in a model that reads them; without any they are 0.
+        The inputs, (N, m), count in a model that reads them; without any they are 0. Raises
+        ``SpecificationError`` for arrays of other shapes.
         """
-        return self.predict_at(system, parameters, self.points(system, states, inputs))
+        x = rows_of("states", states, system.n_states)
+        u = None if inputs is None else rows_of("inputs", inputs, system.n_inputs)
+        theta = numbers("the parameters", parameters, self.n_parameters(system))
+        return self.predict_at(system, theta, self.points(system, x, u))
 
     @abstractmethod
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrate.commands import Command, answer
-from orchestrate.errors import ExitCode
-from orchestrate.files import whole, writing
+from orchestrate.errors import ExitCode, whole, writing
 from orchestrate.program import UsageError, integer, path, positive, tell
 
 if TYPE_CHECKING:

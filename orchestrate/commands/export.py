@@ -17,8 +17,7 @@ from dopt.errors import DoptError
 from dopt.types import Array
 from orchestrate.commands import Command, add_filters, answer, chosen
 from orchestrate.commands.results import counts
-from orchestrate.errors import ExitCode
-from orchestrate.files import whole
+from orchestrate.errors import ExitCode, whole
 from orchestrate.program import UsageError, check_removed, path
 from orchestrate.store import ConfigRow, Reader, Trajectory, public
 from orchestrate.store.records import now, unpacked_trajectory
@@ -43,8 +42,7 @@ _OUTCOME = {
     for name in OUTCOME_COLUMNS
 }
 _STEP = {"seed": _WHOLE, "status": _TEXT, "t": _WHOLE}
-_OF_CONFIG = {"config": _TEXT, **_SECTIONS, **_SIZES}
-"""Columns of the configuration; ``config`` is the beginning of its key."""
+_OF_CONFIG = {"config_key": _TEXT, **_SECTIONS, **_SIZES}
 
 Columns = Mapping[str, str]
 """Kind of each column of a table."""
@@ -65,8 +63,6 @@ ASSESSMENTS: Columns = {**_OF_CONFIG, **_STEP, "measure": _TEXT, "value": _REAL}
 
 ROWS = 50_000
 """Rows of the database in one batch."""
-
-KEY_DIGITS = 12
 
 _CURVES = f"""
 SELECT r.seed, r.status, s.t, {", ".join(f"s.{name}" for name in STEP_VALUES)}
@@ -215,9 +211,7 @@ def _named(name: str, array: Array, n: int) -> dict[str, Any]:
 
 
 def _constants(config: ConfigRow) -> dict[str, Any]:
-    names = [*_SECTIONS, *_SIZES]
-    key = config.config_key[:KEY_DIGITS]
-    return {"config": key, **{name: getattr(config, name) for name in names}}
+    return {name: getattr(config, name) for name in _OF_CONFIG}
 
 
 def _batch(kinds: Mapping[str, pa.DataType], values: Mapping[str, Any], n: int) -> pa.RecordBatch:

@@ -34,13 +34,10 @@ from orchestrate.store import (
     trial_report,
 )
 from orchestrate.store import Table as Rows
-from orchestrate.store.records import jsonable, utc_text
+from orchestrate.store.records import STATES, jsonable, utc_text
 
 RATE_WINDOW_SECONDS = 300.0
 """Period over which the rate is averaged."""
-
-STATES = ("done", "diverged", "failed", "cancelled", "running", "pending")
-"""Statuses of a trial in the order of display."""
 
 _ENDED = """
 SELECT c.config_key, a.launch_id, count(*) AS ended
@@ -101,12 +98,16 @@ def counts(configs: Iterable[ConfigRow]) -> Counter[str]:
     """Return the number of trials in each state."""
     total = Counter(dict.fromkeys(STATES, 0))
     for config in configs:
-        total.update({state: getattr(config, f"n_{state}") for state in STATES})
+        total.update(config.counts)
     return total
 
 
-def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Status:
-    """Return the status of the configurations, with tracebacks of the ``kinds`` commonest failures.
+MAX_KINDS = 10
+"""Kinds of failures that are shown with a traceback, the commonest."""
+
+
+def gather(reader: Reader, configs: Sequence[ConfigRow]) -> Status:
+    """Return the status of the configurations, with tracebacks of the commonest failures.
 
     ``reader`` is the snapshot from which ``configs`` were read.
     """
@@ -114,7 +115,7 @@ def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Sta
     launches = reader.launches()
     running = [launch for launch in launches if launch.state == "running"]
     detached = [launch for launch in launches if launch.kind == "registration"]
-    failures = failure_kinds(reader, by_key, kinds)
+    failures = failure_kinds(reader, by_key, MAX_KINDS)
     explored = [one for one in explorations(reader) if one.config_key in by_key]
     mixed = [key for key in reader.mixed_code() if key in by_key]
     rate = _rate(reader, by_key, running)

@@ -228,7 +228,7 @@ def precision(key: str, value: object) -> float | None:
     )
 
 
-RETRY = ("failed", "diverged", "all")
+RETRY = ("failed", "diverged", "cancelled", "all")
 
 
 def retried(key: str, value: object) -> str | None:

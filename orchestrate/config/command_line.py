@@ -53,7 +53,6 @@ _OPTIONS = (
     ("--config-path", "-cp"),
     ("--config-name", "-cn"),
     ("--config-dir", "-cd"),
-    ("--experimental-rerun",),
 )
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
@@ -68,6 +67,7 @@ _OF_TRIALS = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
 _NEEDED = re.compile(rf"~(?:{'|'.join((*LAUNCH_SECTIONS, *TRIAL_SECTIONS, 'width'))})(?:=.*)?")
 """Deletion of what every launch reads."""
 
+_COMPLETION = re.compile("(install|uninstall|query)=")
 _OF_HYDRA = re.compile(r"[+~]*hydra[./]")
 _OWN_GRIDS = re.compile(r"[+~]*(hydra/sweeper|hydra\.mode)=")
 
@@ -166,9 +166,21 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
         raise UsageError(f"{' and '.join(several)} cannot be combined: leave one out.")
     if flags.resolve and not (flags.cfg or flags.help):
         raise UsageError("--resolve goes with --cfg or --help: add one of them.")
-    if flags.config_dir and not Path(flags.config_dir).is_dir():
+    if flags.shell_completion and not any(map(_COMPLETION.match, flags.overrides)):
         raise UsageError(
-            f"--config-dir is '{flags.config_dir}', but a folder is expected: give one that exists."
+            "--shell-completion names no shell, but one is expected: write for instance "
+            "--shell-completion install=bash."
+        )
+    for name in ("config_dir", "config_path"):
+        folder, option = getattr(flags, name), f"--{name.replace('_', '-')}"
+        if folder and not Path(folder).is_dir():
+            raise UsageError(
+                f"{option} is '{folder}', but a folder is expected: give one that exists."
+            )
+    if flags.config_path and not Path(flags.config_path).is_absolute():  # from Hydra's view
+        raise UsageError(
+            f"--config-path is '{flags.config_path}', but a whole path is expected: write "
+            f"--config-path {Path(flags.config_path).absolute()}, or add files by --config-dir."
         )
     for word in flags.overrides:
         if word.startswith("="):

@@ -33,6 +33,7 @@ from orchestrate.config import TRIAL_SECTIONS, Combination
 from orchestrate.config.options import (
     KNOWN,
     Axis,
+    keys_of,
     parsed_overrides,
     read_axes,
     unknown_field,
@@ -148,7 +149,7 @@ class _Expansion:
             while holder and not any(has_key(config, holder) for config in configs):
                 holder, _, last = holder.rpartition(".")
             name = f"{holder}.{last}" if holder else last
-            names = {name for config in configs for name in _keys_below(config, holder)}
+            names = {one for config in configs for one in keys_of(_holder(config, holder), last)}
             targets = (OmegaConf.select(one, f"{holder}.{TARGET}") for one in configs if holder)
             target = next(filter(None, targets), None)
             raise unknown_field(name, target, names) if target else unknown_setting(name, names)
@@ -439,11 +440,9 @@ def _index(holder: object, key: str) -> Any:
     return int(key) if isinstance(holder, list) else key
 
 
-def _keys_below(config: DictConfig, holder: str) -> Iterable[str]:
-    """Return the keys below a key; none if it is missing or holds a value."""
+def _holder(config: DictConfig, path: str) -> object:
+    """Return what a dotted path leads to, None without it."""
     node: object = config
-    for part in holder.split(".") if holder else ():
+    for part in path.split(".") if path else ():
         node = node._get_node(part) if isinstance(node, DictConfig) else None
-    if not isinstance(node, DictConfig) or node._is_none() or node._is_missing():
-        return ()
-    return [str(name) for name in node]
+    return node

@@ -474,10 +474,19 @@ def _unknown_option(given: str, options: Iterable[str]) -> str:
 
 def _unknown_key(cause: OmegaConfBaseException) -> str:
     parent, key = cause.parent_node, str(cause.full_key)
-    names = [str(name) for name in parent] if isinstance(parent, DictConfig) else []
+    names = keys_of(parent, key.rpartition(".")[2])
     if isinstance(parent, DictConfig) and TARGET in names:
         return str(unknown_field(key, str(parent[TARGET]), names))
     return str(unknown_setting(key, names))
+
+
+def keys_of(section: object, last: str) -> list[str]:
+    """Return the keys of a section, and ``env.gamma`` where they are searched for ``gamma``."""
+    if not isinstance(section, DictConfig) or section._is_none() or section._is_missing():
+        return []
+    inner = {str(name): section._get_node(name) for name in section}
+    below = (name for name, one in inner.items() if isinstance(one, DictConfig) and last in one)
+    return [*inner, *(f"{name}.{last}" for name in below)]
 
 
 @functools.cache

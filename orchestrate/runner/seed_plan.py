@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from tabulate import tabulate
 
+from dopt.errors import counted
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from orchestrate.config import Grid
@@ -110,9 +111,8 @@ class SeedPlan:
                 return
             self._used |= {key: min(n, len(self._seeds[key])) for key in wanting}
             stage = self._stage(first=before == 0)
-            plural = "s" * (len(wanting) > 1)
-            counts = f"{len(wanting):,} configuration{plural}, up to {n} of {numbers[-1]} seeds: "
-            yield counts, stage
+            counts = counted(len(wanting), "configuration")
+            yield f"{counts}, up to {n} of {numbers[-1]} seeds: ", stage
             self._look(n, self._relative, final_losses([one.trial_key for one in stage.trials]))
 
     def report(self) -> str:

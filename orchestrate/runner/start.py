@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from tabulate import tabulate
 
+from dopt.errors import counted
 from dopt.kernel import compiling, kinds_of
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig, labels
@@ -313,7 +314,7 @@ MAX_LISTED_CAUSES = 3
 
 def _counts(grid: Grid, state: Registration, running: str, heading: str = "") -> str:
     """Return a line for each reason to leave out trials, and one with the counts by status."""
-    lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
+    lines = _left_out(grid)
     if grid.repeats:
         lines.append(f"{grid.repeats:,} of {grid.n_jobs:,} jobs name a trial of the grid again")
     lines.append(f"{heading}{state.done + state.diverged:,} of {state.total:,} already done")
@@ -322,6 +323,10 @@ def _counts(grid: Grid, state: Registration, running: str, heading: str = "") ->
     if state.running_elsewhere:
         lines[-1] += f", {state.running_elsewhere:,} {running}"
     return "\n".join(lines)
+
+
+def _left_out(grid: Grid) -> list[str]:
+    return [f"left out {counted(count, 'trial')}: {why}" for why, count in grid.left_out.items()]
 
 
 def opening(
@@ -349,8 +354,9 @@ def closing(tally: Tally, failures: Counter[str], stop_requested: bool, seconds:
 
 def worked(tally: Tally, scheduler: Scheduler, left: int, seconds: float) -> str:
     """Return the counts of outcomes of a worker, and the number of trials left to others."""
+    done = counted(tally.done + tally.diverged, "trial")
     lines = [
-        f"{tally.done + tally.diverged:,} trials done, {tally.diverged:,} of them diverged, "
+        f"{done} done, {tally.diverged:,} of them diverged, "
         f"{tally.failed:,} failed, in {duration(seconds)}; {left:,} left"
     ]
     if scheduler.refused:
@@ -491,12 +497,10 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
     for trial, label in zip(configs, _labels(configs), strict=True):
         numbers = [f"{rows[trial.config_key][name]:,}" for name in COUNTS]
         lines.append([trial.system.name, label, *numbers])
-    left_out = [f"left out {count:,} trials: {why}" for why, count in grid.left_out.items()]
     total = sum(rows.values(), Counter[str]())
-    plural = "" if total["trials"] == 1 else "s"
-    end = f"{total['trials']:,} trial{plural}, {total['done']:,} done, {total['to run']:,} to run"
+    end = f"{counted(total['trials'], 'trial')}, {total['done']:,} done, {total['to run']:,} to run"
     table = tabulate(lines, tablefmt="plain", disable_numparse=True)
-    return "\n".join([table, *left_out, end])
+    return "\n".join([table, *_left_out(grid), end])
 
 
 def _labels(configs: Sequence[TrialSpec]) -> list[str]:

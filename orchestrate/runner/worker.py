@@ -150,7 +150,8 @@ def _work(
     slots = settings.workers or 1
     chunks = StoredChunks(store, settings.chunk_seconds, slots, length, output.warn)
     chunks.look()
-    output.say(f"{chunks.waiting:,} trials wait, {slots} processes · {store.safe_url}")
+    processes = f"{slots} process{'es' * (slots > 1)}"
+    output.say(f"{chunks.waiting:,} trials wait, {processes} · {store.safe_url}")
     tally = Tally(chunks.left)
     interrupt = Interrupt(WARNINGS, NOTICE, store.hurry)
     with started(settings, work, chunks.configs, output.warn) as executor, interrupt:

@@ -22,8 +22,7 @@ from typing import Literal
 from sqlalchemy import Connection, bindparam, select, text, update
 
 from dopt.spec.config import REGISTRIES, config_label, section_class
-from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError
-from orchestrate.files import whole
+from orchestrate.errors import NoDatabaseError, StoreError, StoreUnavailableError, whole
 from orchestrate.store import launches, records, schema, sqlite
 from orchestrate.store.backend import (
     Backend,
@@ -35,7 +34,7 @@ from orchestrate.store.backend import (
     translated,
     translated_file,
 )
-from orchestrate.store.merge import Merged, merge
+from orchestrate.store.merge import EXPECTED, Merged, merge
 from orchestrate.store.reader import Reader
 from orchestrate.store.schema import (
     ENDED,
@@ -477,12 +476,6 @@ SELECT trial_id, count(*) FILTER (WHERE measure <> '{SAMPLE_LOSS}') AS n,
        sum(CASE WHEN {_not_finite("a", "value")} THEN 1 ELSE 0 END) AS infinite
 FROM assessment a GROUP BY trial_id
 """
-_EXPECTED_ASSESSMENTS = f"""
-SELECT o.config_id, max(n) AS most
-FROM (SELECT trial_id, count(*) AS n FROM assessment WHERE measure <> '{SAMPLE_LOSS}'
-      GROUP BY trial_id) counted
-JOIN trial o ON o.trial_id = counted.trial_id WHERE o.status = 'done' GROUP BY o.config_id
-"""
 _SQL = f"""
 SELECT * FROM (
     SELECT r.trial_id, {_NAME} AS name, {", ".join(_FLAGS)}
@@ -492,7 +485,7 @@ SELECT * FROM (
     LEFT JOIN step e ON e.trial_id = r.trial_id AND e.t = {N_ROWS} - 1
     LEFT JOIN trajectory p ON p.trial_id = r.trial_id
     LEFT JOIN ({_ASSESSMENTS}) a ON a.trial_id = r.trial_id
-    LEFT JOIN ({_EXPECTED_ASSESSMENTS}) m ON m.config_id = r.config_id) AS flagged
+    LEFT JOIN ({EXPECTED}) m ON m.config_id = r.config_id) AS flagged
 WHERE {_SUM} > 0 ORDER BY trial_id
 """
 

@@ -60,8 +60,8 @@ _ATTEMPTS = (
 )
 # All trials of a configuration have the same number of assessments, except explorations, beside
 # the sample loss, which may have been stored of some alone.
-_EXPECTED = (
-    "SELECT config_id, max(n) FROM (SELECT r.config_id, count(*) AS n FROM assessment a "
+EXPECTED = (
+    "SELECT config_id, max(n) AS most FROM (SELECT r.config_id, count(*) AS n FROM assessment a "
     "JOIN trial r ON r.trial_id = a.trial_id JOIN config c ON c.config_id = r.config_id "
     f"WHERE r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
     f"AND a.measure <> '{SAMPLE_LOSS}' "
@@ -143,7 +143,7 @@ class Source:
     def __init__(self, moment: Reader) -> None:
         self._moment = moment
         self._texts: dict[int, str] = {}  # JSON of configurations, empty for another than its key
-        self._expected = dict(map(tuple, moment.rows(_EXPECTED)))
+        self._expected = dict(map(tuple, moment.rows(EXPECTED)))
 
     def launches(self) -> list[dict[str, Any]]:
         self._moment.launches()  # refuses texts that the readers of the target could not read

@@ -145,8 +145,7 @@ _CONFIGS = text(
 )
 _TRIALS = text(
     f"SELECT {', '.join(one.name for one in fields(TrialRow))} "
-    "FROM (SELECT launch_id AS launch, v_trial.* FROM v_trial WHERE config_key = :config_key) AS v "
-    "ORDER BY seed"
+    "FROM v_trial WHERE config_key = :config_key ORDER BY seed"
 )
 _MEASURES = (
     "SELECT DISTINCT measure FROM v_assessment WHERE config_key = :config_key ORDER BY measure"

@@ -212,6 +212,10 @@ def stored_json(text: str, kind: type) -> Any:
 _RESTORE = "it was changed by hand, so restore a copy, or give another database"
 
 
+STATES = ("done", "diverged", "failed", "cancelled", "running", "pending")
+"""Statuses of a trial in the order of display."""
+
+
 @dataclass(frozen=True)
 class ConfigRow:
     """Configuration with the counts of its trials.
@@ -252,10 +256,14 @@ class ConfigRow:
     config: Mapping[str, Any]
 
     @property
+    def counts(self) -> dict[str, int]:
+        """Number of trials in each state, in the order of display."""
+        return {state: getattr(self, f"n_{state}") for state in STATES}
+
+    @property
     def n(self) -> int:
         """Registered trials."""
-        finished = self.n_done + self.n_diverged + self.n_failed + self.n_cancelled
-        return finished + self.n_pending + self.n_running
+        return sum(self.counts.values())
 
 
 @dataclass(frozen=True)
@@ -298,7 +306,7 @@ class TrialRow(Outcome):
     trial_key: str
     status: str
     attempt: int
-    launch: int | None
+    launch_id: int | None
     error_type: str | None
     error_message: str | None
 

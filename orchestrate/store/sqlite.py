@@ -275,9 +275,13 @@ def read_engine(url: URL) -> Engine:
 
 
 def existing_path(url: URL) -> Path:
-    """Return the path of a database; raise ``NoDatabaseError`` if there is no file."""
+    """Return the path of a database.
+
+    Raises ``NoDatabaseError`` if there is nothing, ``StoreError`` for what is no file.
+    """
     path = sqlite_path(url)
     with translated_file(public_url(url)):
+        _refuse_others(path, public_url(url))
         there = path.is_file()
     if not there:
         raise NoDatabaseError(
@@ -285,6 +289,20 @@ def existing_path(url: URL) -> Path:
             "it, or give the URL of another one (--db, or the variable DOPT_DB)."
         )
     return path
+
+
+def _refuse_others(path: Path, url: str) -> None:
+    """Refuse what is there and is no file."""
+    if path.is_dir():
+        raise StoreError(
+            f"The results database {url} is a folder, but a file is expected: give one in it, such "
+            f"as sqlite:///{path / 'results.db'}."
+        )
+    if path.exists() and not path.is_file():
+        raise StoreError(
+            f"The results database {url} is a device, a pipe or a socket, but a file is expected: "
+            "give another path."
+        )
 
 
 def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience: float) -> Engine:
@@ -435,16 +453,7 @@ class SQLiteBackend(Backend):
         super().__init__(engine, public_url(url))
         refuse_unsafe(self._path, self.safe_url)
         with translated_file(self.safe_url):
-            if self._path.is_dir():
-                raise StoreError(
-                    f"The results database {self.safe_url} is a folder, but a file is expected: "
-                    f"give one in it, such as sqlite:///{self._path / 'results.db'}."
-                )
-            if self._path.exists() and not self._path.is_file():
-                raise StoreError(
-                    f"The results database {self.safe_url} is a device, a pipe or a socket, but a "
-                    "file is expected: give another path."
-                )
+            _refuse_others(self._path, self.safe_url)
             self._folder.mkdir(parents=True, exist_ok=True)
         self._locks = LaunchLocks(self._folder)
 
@@ -471,7 +480,7 @@ class SQLiteBackend(Backend):
 
     def _files(self) -> list[tuple[int, int] | None]:
         """Return the identities of the file that the URL names and of the logs in use."""
-        return [_identity(self._given), *(_identity(Path(f"{self._path}{s}")) for s in _LOGS)]
+        return [identity(self._given), *(identity(Path(f"{self._path}{s}")) for s in _LOGS)]
 
     def check(self, written: bool = False) -> None:
         with self._checking:
@@ -564,12 +573,12 @@ class SQLiteBackend(Backend):
             failures = suppress(SQLAlchemyError, sqlite3.Error, StoreError)
             with failures, self.engine.connect() as connection:
                 driver_of(connection).execute(_TRUNCATE)
-        if log and self._saved and self._opened[0] != _identity(self._path):
+        if log and self._saved and self._opened[0] != identity(self._path):
             with suppress(OSError):  # no connection of the pool was left
                 os.truncate(f"{self._path}-wal", 0)
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def identity(path: Path) -> tuple[int, int] | None:
     """Return device and inode of a file, or None without a file."""
     try:
         found = path.stat()
@@ -578,11 +587,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _place(identity: tuple[int, int] | None) -> str:
+def _place(wanted: tuple[int, int] | None) -> str:
     """Return the present path of an open file; empty if it was deleted, or is not known."""
     with suppress(OSError):
         for link in Path("/proc/self/fd").iterdir():
-            if _identity(link) == identity and not str(link.readlink()).endswith(" (deleted)"):
+            if identity(link) == wanted and not str(link.readlink()).endswith(" (deleted)"):
                 return str(link.readlink())
     return ""
 

@@ -57,6 +57,8 @@ def test_every_width_is_told_apart_and_trials_have_one_row_each(results: analysi
     assert trials.trial_key.is_unique
     assert (trials.status == "diverged").sum() == 1
     assert len(trials) == results.configurations().n_done.sum() + 1
+    (view,) = results.reader.rows("SELECT * FROM v_trial LIMIT 1")
+    assert {*trials.columns} == {*view._fields} - {"trial_id"}
 
 
 def test_a_request_narrows(url: str) -> None:

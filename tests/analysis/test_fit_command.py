@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from analysis import cli
+from analysis.outputs import PICTURES, TABLE_FILES
 from orchestrate.store import Reader
 from tests.dopt.fitting.test_fit import stamps, truth
 
@@ -104,10 +105,13 @@ def test_a_database_that_cannot_be_used_is_said_before_the_fit(
 @pytest.mark.parametrize(
     "command", [["figures"], ["report"], ["fit", "motor.yaml", "run.csv"]], ids=" ".join
 )
-def test_a_picture_is_no_folder(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder that was called fit.png was made."""
-    assert cli.main([*command, "--out", "fit.png"]) == 2
-    assert "--out is 'fit.png', but a folder is expected" in capsys.readouterr().err
+@pytest.mark.parametrize("ending", [*PICTURES, *TABLE_FILES, "txt", "json", "gif"])
+def test_a_file_is_no_folder(
+    command: list[str], ending: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Folders that were called fit.png and report.md were made."""
+    assert cli.main([*command, "--out", f"fit.{ending}"]) == 2
+    assert f"--out is 'fit.{ending}', but a folder is expected" in capsys.readouterr().err
 
 
 def test_a_field_that_is_none_is_named(

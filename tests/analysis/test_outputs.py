@@ -52,17 +52,15 @@ def folder(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     fill(f"sqlite:///{whole}", limited(("d_optimal",), range(5)))
     with Reader.open(f"sqlite:///{whole}") as reader:
         outcomes = list(build(reader, select(reader, Filter()), PlotOptions(), target))
-    assert [(outcome.name, outcome.state) for outcome in outcomes] == [
-        (name, "written") for name in (*NAMES, "README.md")
-    ]
+    assert outcomes == [(name, "written") for name in (*NAMES, "README.md")]
     return target
 
 
 def make(reader: Reader, selection: Selection, target: Path, **options: int) -> list[str]:
     return [
-        outcome.state
-        for outcome in build(reader, selection, PlotOptions(), target, QUICK, **options)
-        if outcome.name in QUICK
+        state
+        for name, state in build(reader, selection, PlotOptions(), target, QUICK, **options)
+        if name in QUICK
     ]
 
 
@@ -177,16 +175,13 @@ def test_what_is_drawn_by_changed_code_is_drawn_again(
 def test_steps_to_a_given_loss_need_no_random_inputs(reader: Reader, tmp_path: Path) -> None:
     pair = select(reader, Filter(("pendulum",), ("d_optimal", "uniform")))
     for request, state in ((PlotOptions(), "not drawn"), (PlotOptions(epsilon=1.0), "written")):
-        outcome, *_ = build(reader, pair, request, tmp_path, ("comparison_steps",))
-        assert outcome.state.startswith(state)
+        (_, made), *_ = build(reader, pair, request, tmp_path, ("comparison_steps",))
+        assert made.startswith(state)
 
 
 def test_what_has_no_trials_is_said(reader: Reader, tmp_path: Path) -> None:
     part = select(reader, Filter(("quadrotor",)))
-    states = {
-        outcome.name: outcome.state
-        for outcome in build(reader, part, PlotOptions(), tmp_path, QUICK)
-    }
+    states = dict(build(reader, part, PlotOptions(), tmp_path, QUICK))
     assert states["figure2_spectrum"].startswith("not drawn")
     assert states["comparison"] == "written"
     assert not list(tmp_path.glob("figure2_spectrum*"))

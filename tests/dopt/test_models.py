@@ -13,7 +13,7 @@ from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.kernel.run import KernelTrial
-from dopt.models import RFF, GaussianProcess
+from dopt.models import MODELS, RFF, GaussianProcess
 from dopt.models.gaussian_process import kernel
 from dopt.offline_fit import fit_offline
 from dopt.randomness import PLANNED_DIMENSIONS, draw
@@ -323,6 +323,24 @@ def test_trials_with_other_plans_have_other_keys() -> None:
     assert version("black_box", "random") is None
     assert version("affine", "d_optimal") is None
     assert version("mlp", "d_optimal") is None
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_predictions_are_refused_at_rows_of_another_size(name: str) -> None:
+    """A number too many was left out, and the prediction looked like any other."""
+    model = MODELS[name]()
+    unknown = name in ("affine", "black_box")
+    system = SYSTEMS["pendulum_unknown_gain" if unknown else "pendulum"]()
+    theta = model.initial_parameters(system, np.random.default_rng(0))
+    at = np.array([[0.1, 0.2]])
+    assert model.predict(system, theta, at).shape == (1, 1)
+    for states in (np.zeros((1, 3)), np.zeros((1, 1))):
+        with pytest.raises(SpecificationError, match="states of shape"):
+            model.predict(system, theta, states)
+    with pytest.raises(SpecificationError, match="inputs of shape"):
+        model.predict(system, theta, at, np.zeros((1, 2)))
+    with pytest.raises(SpecificationError, match="parameters"):
+        model.predict(system, np.append(theta, 0.0), at)
 
 
 def test_what_reads_no_inputs_is_refused() -> None:

@@ -211,6 +211,11 @@ class Straight(TrialView):
         raise NotImplementedError
 
 
+def test_an_input_is_held_for_a_step_at_least() -> None:
+    with pytest.raises(SpecificationError, match=r"number of steps .* is 0"):
+        Straight(3).held(np.zeros((1, 1)), 0)
+
+
 def written_out(policy: SpaceFilling, view: Straight, u: float) -> float:
     """Return the worth of an input, sample by sample."""
     system, gamma = view.system, view.system.gamma

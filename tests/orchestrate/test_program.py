@@ -25,10 +25,13 @@ from orchestrate import program
 from orchestrate.errors import (
     ExitCode,
     InfrastructureError,
+    OutputError,
+    make_folder,
+    whole,
     without_password,
     without_password_in_word,
+    writing,
 )
-from orchestrate.files import OutputError, make_folder, whole, writing
 from orchestrate.program import as_started
 from orchestrate.runner.saving import launch_record
 from orchestrate.store import StoreUnavailableError

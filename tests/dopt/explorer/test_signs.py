@@ -18,8 +18,8 @@ import dopt.explorer.signs as signs_module
 from analysis.serve.app import create_app
 from dopt import Explorer, encoder
 from dopt.control import planning
+from dopt.errors import counted
 from dopt.explorer.signs import SIGNS
-from dopt.log_columns import count_text
 from dopt.models import gaussian_process
 from dopt.spec.scaled import in_scaled_numbers
 from dopt.types import Array
@@ -71,7 +71,7 @@ def test_an_undeclared_delay_is_said_in_samples(
         drive(one, STEPS, delay)
         assert one.counts["late"] == 2  # at steps 500 and 800
     [text] = [text for text in said(caplog) if "earlier steps" in text]
-    assert f"{count_text(delay, 'sample')} before" in text
+    assert f"{counted(delay, 'sample')} before" in text
     with Explorer(
         dataclasses.replace(MOTOR, delay=delay * MOTOR.dt), policy="random", steps=STEPS
     ) as one:
@@ -90,7 +90,7 @@ def test_a_delay_that_is_declared_too_long_is_said(
         drive(one, STEPS, delay)
         assert (one.counts["early"], one.counts["late"]) == (2, 0)
     [text] = [text for text in said(caplog) if "not to act yet" in text]
-    assert f"{count_text(delay, 'sample')} before" in text
+    assert f"{counted(delay, 'sample')} before" in text
 
 
 def test_a_delay_that_a_fit_shortens_is_tested_on() -> None:

@@ -16,7 +16,7 @@ import pyarrow.parquet
 import pytest
 
 from orchestrate.commands import export as tables
-from orchestrate.store import Claim, Store
+from orchestrate.store import Claim, Reader, Store
 from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, on_both, run_now
 from tests.orchestrate.store.fakes import HORIZON, Spec, assessed, diverged, result
 from tests.paths import ROOT, without_coverage
@@ -108,6 +108,26 @@ class TestTables:
             assert [*frame.t] == [row.t for row in expected]
             assert [*frame.value][:-1] == [row.value for row in expected][:-1]
             assert np.isnan([*frame.value][-1])
+
+    def test_every_table_is_joined_by_the_columns_of_the_views(
+        self, command: Run, tmp_path: Path, url: str
+    ) -> None:
+        """No column has another name than in the database."""
+        with Reader.open(url) as reader:
+            views = ("v_trial", "v_curve", "step")
+            firsts = [next(iter(reader.rows(f"SELECT * FROM {name} LIMIT 1"))) for name in views]
+        known = {name for row in firsts for name in row._fields}
+        tables = {}
+        for kind in ("trials", "curves", "trajectories"):
+            command("export", kind, "--out", str(tmp_path / f"{kind}.parquet"))
+            tables[kind] = read(tmp_path / f"{kind}.parquet")
+            own = {name for name in tables[kind] if not name.startswith(("state_", "input_"))}
+            assert own <= known
+        for kind, rows in (("curves", HORIZON), ("trajectories", HORIZON + 1)):
+            joined = tables[kind].merge(tables["trials"], on=["config_key", "seed"])
+            assert joined.groupby("trial_key").size().to_dict() == {
+                spec.trial_key: rows for spec in RESULTS
+            }
 
     def test_null_is_null_in_parquet(self, command: Run, tmp_path: Path) -> None:
         out = tmp_path / "curves.parquet"

@@ -229,6 +229,8 @@ def test_a_key_that_some_choices_lack_holds_for_the_others(
             "nothere=1",
             "setting 'nothere' is unknown: did you mean 'nothing'\\? Choose one of env, ",
         ),
+        ("dt=1", "setting 'dt' is unknown: did you mean 'env.dt'"),
+        ("order=1", "setting 'order' is unknown: did you mean 'model.order'"),
         ("env.dtt=[1]", "setting of env 'dtt' is .*: did you mean 'dt'"),
         ("env.dtt.x=1", "setting of env 'dtt' is .*: did you mean 'dt'"),
         ("env.dt.x=1", "'x' is unknown, no setting of env.dt exists: remove it"),

@@ -19,9 +19,10 @@ from dopt.policies import POLICIES
 from dopt.registry import build
 from dopt.spec.trial import TrialSpec
 from dopt.systems import NAMED_SYSTEMS
-from orchestrate.config import Combination, LaunchSettings, build_grid
+from orchestrate.config import RETRY, Combination, LaunchSettings, build_grid
 from orchestrate.config.command_line import read_command_line
 from orchestrate.config.options import option_names
+from orchestrate.store import RETRIED
 from tests.paths import ROOT
 
 CONF = ROOT / "conf"
@@ -266,6 +267,10 @@ hydra:
       - {policy: "random,uniform"}
       - {policy: uniform, env: "arm,pendulum"}
 """
+
+
+def test_a_launch_retries_what_the_command_retries() -> None:
+    assert {*RETRY} == {*RETRIED}
 
 
 TYPED = """

@@ -397,7 +397,7 @@ def test_a_configuration_that_is_not_that_of_its_key_stays_out(
     execute(other, f"UPDATE config SET {changed} {where}")
     assert main(["merge", other, "--db", url]) == 1
     output = capsys.readouterr().out
-    assert "copied 1 trials (1 done)\n2 contradict their keys or the shapes of" in output
+    assert "copied 1 trial (1 done)\n2 contradict their keys or the shapes of" in output
     assert execute(url, "SELECT policy FROM config") == [("d_optimal",)]
 
 
