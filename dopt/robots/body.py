@@ -340,20 +340,6 @@ class KnownBody:
         result: Array = 1.0 / np.diag(np.linalg.inv(self.mass_matrix()))
         return result
 
-    def hang(self, mass: float, moment: Array) -> None:
-        """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
-        model, last = self.model, self.body.moved[-1]
-        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
-        total = own + mass
-        if total <= 0.0:  # of a frame without mass, from which none can be taken
-            return
-        model.body_mass[last] = total
-        model.body_ipos[last] = (own * centre + moment) / total
-        if mass > 0.0:
-            away = moment / mass - centre
-            model.body_inertia[last] += own * mass / total * (away @ away)
-        self._engine.mj_setConst(model, self._data)
-
 
 class Contacts:
     """Pairs of bodies that come near each other.
@@ -466,6 +452,39 @@ def inertial(model: mujoco.MjModel, bodies: Sequence[int]) -> Array:
         about = about_com + m * (c @ c * np.eye(3) - np.outer(c, c))
         rows.append([m, *(m * c), *np.diag(about), *about[np.triu_indices(3, 1)]])
     return np.concatenate(rows)
+
+
+def point(mass: float, moment: Array, least: float = 0.0) -> Array:
+    """Return the inertial parameters of a point mass, (10,), by its first moment, (3,).
+
+    Its inertia is by a mass of the magnitude ``least`` where it has less.
+    """
+    spread = moment @ moment * np.eye(3) - np.outer(moment, moment)
+    about = spread / np.copysign(max(abs(mass), least), mass)
+    return np.array([mass, *moment, *np.diag(about), *about[np.triu_indices(3, 1)]])
+
+
+def hang(model: mujoco.MjModel, b: int, added: Array) -> None:
+    """Add inertial parameters, (10,), to a body of a model; without mass, it stays as it is."""
+    m, *rest = inertial(model, [b]) + added
+    if m <= 0.0:
+        return
+    c, (x, y, z) = np.array(rest[:3]) / m, rest[6:]
+    about = np.diag(rest[3:6]) + np.array([[0.0, x, y], [x, 0.0, z], [y, z, 0.0]])
+    moments, axes = np.linalg.eigh(about - m * (c @ c * np.eye(3) - np.outer(c, c)))
+    model.body_mass[b], model.body_ipos[b] = m, c
+    model.body_inertia[b] = np.maximum(moments, 0.01 * model.body_inertia[b].min())
+    turn = Rotation.from_matrix(np.linalg.det(axes) * axes)
+    model.body_iquat[b] = turn.as_quat(scalar_first=True)
+    settle(model)
+
+
+def settle(model: mujoco.MjModel) -> None:
+    """Let a model take changed inertias: no short cuts for centres at 0 and constant ones."""
+    import mujoco
+
+    model.body_sameframe[:] = model.body_simple[:] = model.dof_simplenum[:] = 0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _pseudo_inertias() -> Array:

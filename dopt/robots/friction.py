@@ -276,20 +276,26 @@ class FrictionLearner:
         self.unit = self.noise * np.sqrt(1.0 + variance)
         result = np.where(moving, standard / self.noise, np.nan)
         spread = self._spread(rows)
-        self.mean += spread * (error / (1.0 + variance))[:, None]
-        self.covariance -= spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
-        self._squares += np.where(moving, [standard**2, np.ones(self.n)], 0.0)
-        self._pending += np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
-        full = self._pending[1] >= BATCH
-        self._batches += np.where(full, [self._pending[0] ** 2 / BATCH, np.ones(self.n)], 0.0)
-        self._pending[:, full] = 0.0
-        self.windows += moving
+        # New arrays: a shallow copy keeps what was known before.
+        self.mean = self.mean + spread * (error / (1.0 + variance))[:, None]
+        taken = spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
+        self.covariance = self.covariance - taken
+        self._squares = self._squares + np.where(moving, [standard**2, np.ones(self.n)], 0.0)
+        pending = self._pending + np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
+        full = pending[1] >= BATCH
+        batch = np.where(full, [pending[0] ** 2 / BATCH, np.ones(self.n)], 0.0)
+        self._batches, self._pending = self._batches + batch, np.where(full, 0.0, pending)
+        self.windows = self.windows + moving
         return result
+
+    def restore(self, before: FrictionLearner) -> None:
+        """Return to an earlier shallow copy of this learner."""
+        vars(self).update(vars(before))
 
     def forget(self, factor: float) -> None:
         """Multiply the errors of friction: the body that it was learned with has changed."""
-        self.covariance[:, : self.p] *= factor
-        self.covariance[:, :, : self.p] *= factor
+        of = np.where(np.arange(self.mean.shape[1]) < self.p, factor, 1.0)
+        self.covariance = self.covariance * np.outer(of, of)
         self._expected = None
 
     def rows(self, speeds: Array) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.optimize
 
 from dopt.errors import SpecificationError, unknown_name
-from dopt.robots.body import Body, Motion, inertial
+from dopt.robots.body import Body, Motion, inertial, settle
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -147,19 +147,15 @@ class Unknowns:
 
         :meth:`regressor` is then of the torque that a gear makes, ``gears`` times the command.
         """
-        import mujoco
-
         body, model = self.body, copy.copy(self.body.model)
         gears = np.ones(body.n)
-        # Short cuts of the engine for centres at 0 and constant inertias.
-        model.body_sameframe[:] = model.body_simple[:] = model.dof_simplenum[:] = 0
         for one, value in zip(self.parameters, values, strict=True):
             if one.kind == "gear":
                 gears[body.joints.index(one.place)] = value
             else:
                 numbers, at = _numbers(body, model, one.kind, one.place)
                 numbers[at] = value
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        settle(model)
         result = copy.copy(self)
         result.body = Body(model, body.source)
         result._directions = result._inertial_directions()

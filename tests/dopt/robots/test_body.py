@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body, Contacts, Motion
+from dopt.robots.body import Body, Contacts, KnownBody, Motion, hang, point
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Identifiability, Unknowns, count_null, relative_errors
 from tests.paths import ROOT, printed
@@ -192,6 +192,27 @@ def test_regressors_at_other_values_are_derivatives_there(arm: Body, limits: Lim
         more, less = (unknowns.at(values + way)[0].body.torques(motion) for way in (step, -step))
         expected = (more - less) / 2e-5
         np.testing.assert_allclose(rows[:, :, i], expected, atol=1e-5 * max(1.0, np.ptp(expected)))
+
+
+@pytest.mark.parametrize("link", ["pos='.1 0 .2' euler='.3 .2 .1'", ""])
+def test_what_hangs_on_a_body_moves_as_if_it_were_in_the_file(link: str) -> None:
+    """Once it added its inertia about all axes, and its weight to a centre at 0 that stayed."""
+    last = f"""<mujoco><worldbody><body pos="0 0 1" euler="1 .4 0"><joint axis="0 0 1"/>
+        <geom size=".05" mass="1"/><body pos=".3 0 0"><joint axis="0 1 .5"/>
+        <geom type="box" size=".03 .05 .2" {link} mass=".8"/>{{}}</body></body></worldbody></mujoco>
+        """
+    mass, centre, own = 0.6, np.array([0.1, -0.2, 0.15]), 0.4 * 0.6 * 0.04**2
+    ball = f'<geom size=".04" pos="{" ".join(map(str, centre))}" mass="{mass}"/>'
+    body, whole, motion = body_of(last.format("")), body_of(last.format(ball)), random_motion(2)
+    known = KnownBody(body)
+    for way in (1.0, -1.0):
+        added = point(mass, mass * centre)
+        added[4:7] += own
+        hang(known.model, body.moved[-1], way * added)
+        same = whole if way > 0.0 else body
+        states = zip(motion.positions, motion.velocities, motion.accelerations, strict=True)
+        found = np.array([known.inverse(*state) for state in states])
+        np.testing.assert_allclose(found, same.torques(motion), atol=1e-9)
 
 
 def test_dry_friction_and_gear(arm: Body, limits: Limits) -> None:
