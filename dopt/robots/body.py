@@ -186,8 +186,7 @@ class Body:
         positions = (model.key_qpos[0] if model.nkey else model.qpos0)[self.addresses]
         low, high = model.jnt_range[self._ids].T
         outside = model.jnt_limited[self._ids] & ((positions < low) | (positions > high))
-        result: Array = np.where(outside, (low + high) / 2.0, positions)
-        return result
+        return np.asarray(np.where(outside, (low + high) / 2.0, positions))
 
     @property
     def ranges(self) -> Array:
@@ -195,8 +194,7 @@ class Body:
         limited = self.model.jnt_limited[self._ids].astype(bool)
         free = np.where(self.model.jnt_type[self._ids] == HINGE, np.pi, 0.5)
         around = self.home[:, None] + free[:, None] * [-1.0, 1.0]
-        result: Array = np.where(limited[:, None], self.model.jnt_range[self._ids], around)
-        return result
+        return np.asarray(np.where(limited[:, None], self.model.jnt_range[self._ids], around))
 
     def regressor(self, motion: Motion) -> Array:
         """Return how torques depend on the inertial parameters, (T, n, 10 · bodies).
@@ -225,8 +223,8 @@ class Body:
             states = zip(motion.positions, motion.velocities, motion.accelerations, strict=True)
             return np.array([self._known.inverse(*state) for state in states])
         rows = self.regressor(motion) if regressor is None else regressor
-        result: Array = rows @ self.inertial + model.dof_armature[self.dofs] * motion.accelerations
-        return result
+        rotors = model.dof_armature[self.dofs] * motion.accelerations
+        return np.asarray(rows @ self.inertial + rotors)
 
     def columns(self, motion: Motion) -> dict[str, Array]:
         """Return time, q, dq, ddq and tau of each joint, such as ``q_elbow``, each (T,).
@@ -313,7 +311,6 @@ class KnownBody:
         if hasattr(self.model, "dof_dampingpoly"):
             self.model.dof_dampingpoly[:] = 0.0
         self._data = mujoco.MjData(self.model)
-        self._unit, self._column = np.zeros(self.model.nv), np.zeros(self.model.nv)
 
     def inverse(self, q: Array, v: Array, a: Array) -> Array:
         """Return the torques [N m], (n,), that accelerate the body so."""
@@ -327,18 +324,14 @@ class KnownBody:
     def mass_matrix(self) -> Array:
         """Return M, (n, n), at the position of the last call of :meth:`inverse`."""
         dofs = self.body.dofs
-        M = np.empty((len(dofs), len(dofs)))
-        for k, dof in enumerate(dofs):
-            self._unit[dof] = 1.0
-            self._engine.mj_mulM(self.model, self._data, self._column, self._unit)
-            self._unit[dof] = 0.0
-            M[k] = self._column[dofs]
-        return M
+        M = np.zeros((len(dofs), self.model.nv))
+        for column, unit in zip(M, np.eye(self.model.nv)[dofs], strict=True):
+            self._engine.mj_mulM(self.model, self._data, column, unit)
+        return M[:, dofs]
 
     def apparent_inertia(self) -> Array:
         """Return the inertia of each joint while the others are free, (n,), where M is."""
-        result: Array = 1.0 / np.diag(np.linalg.inv(self.mass_matrix()))
-        return result
+        return 1.0 / np.diag(np.linalg.inv(self.mass_matrix()))
 
 
 class Contacts:
@@ -435,8 +428,7 @@ class Contacts:
                 self._engine.mj_jacGeom(model, self._data, *turns, geom)
                 sizes = np.linalg.norm(turns, axis=1)
                 reach = np.maximum(reach, sizes[0] + radius * sizes[1])
-        result: Array = reach[self._body.dofs]
-        return result
+        return np.asarray(reach[self._body.dofs])
 
 
 HINGE, SLIDE = 3, 2
@@ -518,8 +510,7 @@ def _twist(model: mujoco.MjModel, j: int) -> Array:
 
 def rotation(quaternion: Array) -> Array:
     """Return the rotation of a unit quaternion (w, x, y, z), (3, 3)."""
-    result: Array = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    return result
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 def _effective(model: mujoco.MjModel) -> mujoco.MjModel:

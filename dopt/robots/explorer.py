@@ -346,8 +346,7 @@ class RobotExplorer:
         """Return which joints, (n,), braking from now, come to rest beyond where they may go."""
         rest = q + v * np.abs(v) / (2.0 * self.acceleration)
         above, below = (rest > self._high) & (v > 0.0), (rest < self._low) & (v < 0.0)
-        result: npt.NDArray[np.bool_] = above | below
-        return result
+        return np.asarray(above | below)
 
     def _pace(self) -> None:
         """Leave room between references and limits of velocity for rates that run ahead."""
@@ -505,10 +504,8 @@ class RobotExplorer:
         spread = np.eye(len(sums)) + rows @ self.payload[1] @ rows.T
         return bool(sums @ np.linalg.solve(spread, sums) > self._alarm)
 
-    def _led(self, means: tuple[Array, ...], rates: Array | None) -> tuple[Array, ...]:
+    def _led(self, means: tuple[Array, ...], rates: Array) -> tuple[Array, ...]:
         """Return position, rate and acceleration as references give them: free of noise."""
-        if rates is None:
-            return means
         way = self.dt * np.cumsum(np.vstack([0.0 * rates[:1], rates]), axis=0)
         return means[0], *self.learner.window.means(way, way)[1:3]
 
@@ -613,5 +610,4 @@ def _mean_features(start: Array, end: Array) -> Array:
     """Return the means of the features of ripple between positions, each (k,), (k, 62)."""
     a, b = start[:, None] * RIPPLE, end[:, None] * RIPPLE
     cosines, sines = np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)
-    result: Array = np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2)
-    return result
+    return np.asarray(np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2))

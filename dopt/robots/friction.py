@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 import numpy as np
 from scipy.optimize import brentq
@@ -68,25 +67,11 @@ SIGN = 0.003
 """Width in which dry friction is taken to change its sign."""
 
 
-class FrictionModel(Protocol):
-    """Friction of n joints with p parameters each; rates and torques as parts of the limits."""
-
-    start: Array
-    """Parameters before any sample, (n, p)."""
-    spread: Array
-    """Their standard deviations, (p,)."""
-
-    def torques(self, parameters: Array, x: Array) -> Array:
-        """Return f at rates (n, k), (n, k)."""
-
-    def jacobian(self, parameters: Array, x: Array) -> Array:
-        """Return J = ∂f/∂θ, (n, k, p)."""
-
-
 class CoulombViscous:
     """Coulomb and viscous friction, and Stribeck terms of fixed widths: linear in its parameters.
 
     The parameters are the Coulomb torque, the viscous torque at the velocity limit, and heights.
+    They begin at ``start``, (n, p), with standard deviations ``spread``, (p,); rates x are (n, k).
     """
 
     widths = np.array([0.015, 0.03, 0.06])
@@ -96,8 +81,7 @@ class CoulombViscous:
         self.start = np.zeros((n, len(self.spread)))
 
     def torques(self, parameters: Array, x: Array) -> Array:
-        result: Array = np.einsum("nkp,np->nk", self.jacobian(parameters, x), parameters)
-        return result
+        return np.asarray(np.einsum("nkp,np->nk", self.jacobian(parameters, x), parameters))
 
     def jacobian(self, parameters: Array, x: Array) -> Array:  # noqa: ARG002  # linear in them
         sign = np.tanh(x / SIGN)
@@ -123,8 +107,7 @@ class Network:
 
     def torques(self, parameters: Array, x: Array) -> Array:
         t = self.jacobian(parameters, x)[..., :7]
-        result: Array = (parameters[:, None, :7] * t).sum(axis=2) + parameters[:, 21:]
-        return result
+        return np.asarray((parameters[:, None, :7] * t).sum(axis=2) + parameters[:, 21:])
 
     def jacobian(self, parameters: Array, x: Array) -> Array:
         c, s = parameters[:, None, :7], np.exp(parameters[:, None, 7:14])
@@ -132,6 +115,8 @@ class Network:
         bent = c * (1.0 - t**2)
         return np.concatenate([t, bent * s * x[..., None], bent, np.ones((*x.shape, 1))], axis=2)
 
+
+FrictionModel = CoulombViscous | Network
 
 FRICTION: Mapping[str, Callable[[int, int], FrictionModel]] = {
     "coulomb_viscous": lambda n, _: CoulombViscous(n),
@@ -200,20 +185,17 @@ class FrictionLearner:
     @property
     def noise(self) -> Array:
         """Standard deviation of a window's torque, (n,), as a part of the limit."""
-        result: Array = np.sqrt(self._squares[0] / self._squares[1])
-        return result
+        return np.asarray(np.sqrt(self._squares[0] / self._squares[1]))
 
     @property
     def inflation(self) -> Array:
         """Variance of means of innovations relative to uncorrelated ones, (n,), at least 1."""
-        result: Array = np.maximum(1.0, self._batches[0] / self._batches[1])
-        return result
+        return np.asarray(np.maximum(1.0, self._batches[0] / self._batches[1]))
 
     def torques(self, velocities: Array) -> Array:
         """Return friction as it was learned [N m], (n,), at velocities (n,)."""
         x = (velocities / self.limits.velocity)[:, None]
-        result: Array = self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
-        return result
+        return self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
 
     def feedforward(self, velocities: Array) -> Array:
         """Return friction to feed forward [N m], (n,), at velocities (n,).
@@ -226,8 +208,7 @@ class FrictionLearner:
         rows = self.model.jacobian(parameters, x)
         variance = (rows @ self.covariance[:, : self.p, : self.p] * rows).sum(axis=(1, 2))
         size = np.abs(value) - self.noise * np.sqrt(np.maximum(variance, 0.0))
-        result: Array = np.sign(value) * np.maximum(size, 0.0) * self.limits.torque
-        return result
+        return np.asarray(np.sign(value) * np.maximum(size, 0.0) * self.limits.torque)
 
     def innovations(
         self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
@@ -323,8 +304,7 @@ class FrictionLearner:
         block = self.covariance[:, : self.p, : self.p]
         variance = np.einsum("nkp,npq,nkq->nk", rows, block, rows)
         scale = self.noise * np.sqrt(self.inflation)
-        result: Array = np.sqrt(np.maximum(variance, 0.0)) * scale[:, None]
-        return result
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * scale[:, None])
 
     def intervals(self) -> tuple[Array, Array]:
         """Return values and half-widths as parts of the torque limit, each (n, 14).
@@ -336,8 +316,7 @@ class FrictionLearner:
 
     def sizes(self) -> Array:
         """Return the root mean square of each joint's curve, (n,), as a part of the limit."""
-        result: Array = np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
-        return result
+        return np.asarray(np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1)))
 
     def _information(self, errors: Array) -> Array | None:
         """Return the information expected at the stop, (n, 14), None until it is near.

@@ -97,8 +97,7 @@ class Limits:
     @property
     def middle(self) -> Array:
         """Middle of the ranges of position, (n,)."""
-        result: Array = self.position.mean(axis=1)
-        return result
+        return np.asarray(self.position.mean(axis=1))
 
     def parts(self, motion: Motion, torques: Array | None = None) -> dict[str, Array]:
         """Return a motion as parts of each kind of limit, (T, n); 1 and -1 are the limits."""
@@ -186,11 +185,8 @@ def _torques(body: Body) -> Array:
         if model.actuator_forcelimited[a]:
             found[j] = min(found[j], abs(gear) * np.abs(model.actuator_forcerange[a]).min())
         plain = (model.actuator_gaintype[a], model.actuator_biastype[a]) == (0, 0)
-        if (
-            plain
-            and model.actuator_dyntype[a] != INTEGRATOR
-            and model.actuator_ctrllimited[control]
-        ):
+        plain &= model.actuator_dyntype[a] != INTEGRATOR
+        if plain and model.actuator_ctrllimited[control]:
             gain = abs(gear * model.actuator_gainprm[a, 0])
             found[j] = min(found[j], gain * np.abs(model.actuator_ctrlrange[control]).min())
     return found

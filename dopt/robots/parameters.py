@@ -9,11 +9,12 @@ from __future__ import annotations
 import copy
 import dataclasses
 import fnmatch
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.optimize
+import scipy.linalg
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.robots.body import Body, Motion, inertial, settle
@@ -279,9 +280,8 @@ class Unknowns:
 
     def weighted(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the regressor in units of the noise, (T, n, p), as of ``rate`` rows a second."""
-        noise = self.noise * self.limits.torque
-        result: Array = self.regressor(motion, rigid) * (np.sqrt(rate * motion.dt) / noise)[:, None]
-        return result
+        scales = np.sqrt(rate * motion.dt) / (self.noise * self.limits.torque)
+        return np.asarray(self.regressor(motion, rigid) * scales[:, None])
 
 
 def _numbers(body: Body, model: Any, kind: str, place: str) -> tuple[Array, tuple[int, ...]]:
@@ -355,34 +355,28 @@ def relative_errors(information: Array) -> Array:
 def _sparse(rows: Array) -> Array:
     """Return a basis of the space of some rows, (k, p), that has few parts other than 0.
 
-    Of the space, the vector with the least sum of magnitudes is taken for each parameter that is to
-    be 1 in it; of these the sparsest that are independent.
+    Each vector of it is alone to have a part at its pivot; then multiples of others are taken from
+    it for as long as that leaves fewer parts.
     """
-    k, p = rows.shape
+    k, fewer = len(rows), True
     if not k:
         return rows
-    found = []
-    for i in np.flatnonzero(np.abs(rows).max(axis=0) > SMALL):
-        # rowsᵀ c = a - b with a, b >= 0, least sum of a + b.
-        one = scipy.optimize.linprog(
-            np.concatenate([np.zeros(k), np.ones(2 * p)]),
-            A_eq=np.vstack(
-                [np.hstack([rows.T, -np.eye(p), np.eye(p)]), [*rows[:, i], *np.zeros(2 * p)]]
-            ),
-            b_eq=[*np.zeros(p), 1.0],
-            bounds=[(None, None)] * k + [(0.0, None)] * (2 * p),
-        )
-        if one.success and one.x is not None:
-            vector = one.x[:k] @ rows
-            found.append(np.where(np.abs(vector) > SMALL * np.abs(vector).max(), vector, 0.0))
-    found.sort(key=np.count_nonzero)
-    basis: list[Array] = []
-    for vector in found:
-        together = np.array([*basis, vector])
-        together /= np.linalg.norm(together, axis=1, keepdims=True)
-        if np.linalg.svd(together, compute_uv=False)[-1] > SMALL:
-            basis.append(vector)
-    return np.array(basis).reshape(-1, p)
+    pivots = scipy.linalg.qr(rows, mode="r", pivoting=True)[1][:k]
+    basis = _rounded(np.array(np.linalg.solve(rows[:, pivots], rows), dtype=float))
+    while fewer:
+        fewer = False
+        for i, j in itertools.permutations(range(k), 2):
+            for at in np.flatnonzero(basis[i] * basis[j]):
+                one = _rounded(basis[i] - basis[i, at] / basis[j, at] * basis[j])
+                if np.count_nonzero(one) < np.count_nonzero(basis[i]):
+                    basis[i], fewer = one, True
+    return basis[np.argsort(np.count_nonzero(basis, axis=1), kind="stable")]
+
+
+def _rounded(rows: Array) -> Array:
+    """Return combinations without parts that are small beside their largest one."""
+    sizes = np.abs(rows)
+    return np.where(sizes > SMALL * sizes.max(axis=-1, keepdims=True), rows, 0.0)
 
 
 def _words(row: Array, unknowns: Unknowns) -> str:

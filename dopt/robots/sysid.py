@@ -165,5 +165,4 @@ def _state(body: Body, model: Any, times: Array, positions: Array, row: int) -> 
     qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
     qpos[body.addresses] = fit[-1]
     qvel[body.dofs] = fit[-2] - bent * model.opt.timestep
-    result: Array = sysid.create_initial_state(model, qpos, qvel)
-    return result
+    return np.asarray(sysid.create_initial_state(model, qpos, qvel))

@@ -108,8 +108,7 @@ class Tracker:
 
         A reference that is moved back by what a better feedforward makes up for does not hurry.
         """
-        result: Array = torque / self._gains()[0]
-        return result
+        return torque / self._gains()[0]
 
 
 class Guard:

@@ -84,8 +84,7 @@ class Family(ABC):
         """
 
     def _times(self, dt: float) -> Array:
-        result: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
-        return result
+        return dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
 
     def _centres(self, numbers: Array) -> Array:
         """Return the positions about which joints move, (n,): the middle third of the ranges."""
@@ -115,8 +114,7 @@ class Fourier(Family):
     @property
     def rates(self) -> Array:
         """Angular frequencies, (k,) [rad/s]."""
-        result: Array = 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
-        return result
+        return 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
 
     @property
     def size(self) -> int:
@@ -157,8 +155,7 @@ class Multisine(Fourier):
     @property
     def rates(self) -> Array:
         lines = max(3, int(min(self.fastest * self.seconds, 20)))
-        result: Array = 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
-        return result
+        return 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -381,8 +378,7 @@ def _taken(
 ) -> Array:
     """Return the largest shares of a room for positions and of the limits of rates, (n,)."""
     parts = positions / room, velocities / limits.velocity, accelerations / limits.acceleration
-    result: Array = np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
-    return result
+    return np.asarray(np.max([np.abs(part).max(axis=0) for part in parts], axis=0))
 
 
 def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:
