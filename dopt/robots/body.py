@@ -366,9 +366,8 @@ class Contacts:
         for a, b in (pairs.T, pairs.T[::-1]):
             np.minimum.at(self._kept, (a, b), at_home)
         self.touching = self._touching(body.home)
-        self.always, random = set(self.touching), np.random.default_rng(0)
-        low, high = body.ranges.T
-        for q in low + (high - low) * random.random((ANYWHERE * bool(self.always), body.n)):
+        self.always = set(self.touching)
+        for q in poses(body.ranges, ANYWHERE * bool(self.always)):
             self.always &= self._touching(q)
         for a, b in self.always:
             self._kept[a, b] = self._kept[b, a] = -np.inf
@@ -420,9 +419,9 @@ class Contacts:
 
         The largest over 200 random positions within limits, (n, 2).
         """
-        model, random, (low, high) = self._model, np.random.default_rng(0), limits.T
+        model = self._model
         reach, turns = np.zeros(model.nv), np.zeros((2, 3, model.nv))
-        for q in low + (high - low) * random.random((200, len(limits))):
+        for q in poses(limits, 200):
             self._pass(q)
             for geom, radius in enumerate(model.geom_rbound):
                 self._engine.mj_jacGeom(model, self._data, *turns, geom)
@@ -433,6 +432,12 @@ class Contacts:
 
 HINGE, SLIDE = 3, 2
 """Types of joints of MuJoCo."""
+
+
+def poses(ranges: Array, count: int) -> Array:
+    """Return random positions, (count, n), within ranges, (n, 2): always the same."""
+    low, high = ranges.T
+    return np.asarray(low + (high - low) * np.random.default_rng(0).random((count, len(ranges))))
 
 
 def inertial(model: mujoco.MjModel, bodies: Sequence[int]) -> Array:

@@ -17,7 +17,7 @@ the intervals hold.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import brentq
@@ -77,7 +77,7 @@ class CoulombViscous:
     widths = np.array([0.015, 0.03, 0.06])
     spread = np.array([0.1, 0.1, 0.015, 0.015, 0.015])
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, seed: int = 0) -> None:  # noqa: ARG002  # zeros for any seed
         self.start = np.zeros((n, len(self.spread)))
 
     def torques(self, parameters: Array, x: Array) -> Array:
@@ -116,12 +116,8 @@ class Network:
         return np.concatenate([t, bent * s * x[..., None], bent, np.ones((*x.shape, 1))], axis=2)
 
 
-FrictionModel = CoulombViscous | Network
-
-FRICTION: Mapping[str, Callable[[int, int], FrictionModel]] = {
-    "coulomb_viscous": lambda n, _: CoulombViscous(n),
-    "network": Network,
-}
+FRICTION: dict[str, type[CoulombViscous | Network]]
+FRICTION = {"coulomb_viscous": CoulombViscous, "network": Network}
 """Models of friction, by their names, of n joints and a seed."""
 
 
@@ -169,7 +165,7 @@ class FrictionLearner:
             raise unknown_name("friction", friction, FRICTION)
         n = len(limits.torque)
         self.limits, self.window, self._inverse = limits, Window(dt, window), inverse
-        self.model: FrictionModel = FRICTION[friction](n, seed)
+        self.model = FRICTION[friction](n, seed)
         self.n, self.p = n, self.model.start.shape[1]
         spread = self.model.spread / NOISE
         ripple = np.full(2 * len(RIPPLE), RIPPLE_SIZE / math.sqrt(len(RIPPLE)))

@@ -314,7 +314,10 @@ def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
     [
         ("joints: {wrist: {velocity: 2}}", "joint 'wrist' is unknown"),
         ("joints: {lift: {speed: 2}}", "limit of joint 'lift' 'speed' is unknown"),
-        ("joints: {lift: {velocity: fast}}", "lift.velocity in .* is 'fast', but a positive"),
+        ("joints: {lift: {velocity: fast}}", "lift.velocity in .* is 'fast', but a number above 0"),
+        ("joints: {lift: {torque: true}}", "lift.torque in .* is True, but a number above 0"),
+        ("joints: {lift: {position: [1, 2, 3]}}", r"has the shape \(3,\) .* but 2 real numbers"),
+        ("joints: {lift: {position: .nan}}", r"is \[nan, nan\], but finite numbers"),
         ("joints: {lift: {position: [2, 1]}}", r"is \[2, 1\], but \[low, high\]"),
         ("joints: {lift: 3}", "lift in .* is 3, but a mapping"),
         ("[1, 2]", "has no mapping 'joints'"),
