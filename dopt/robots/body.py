@@ -573,19 +573,20 @@ def _closed(model: mujoco.MjModel, ids: list[int], paths: list[list[int]]) -> li
     """Return the equality constraints that some motion of the driven joints alone breaks."""
     import mujoco
 
-    kinds, found = mujoco.mjtEq, list[str]()
-    of_bodies = int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)
+    kinds, objects, found = mujoco.mjtEq, mujoco.mjtObj, list[str]()
     for e in np.flatnonzero(model.eq_active0):
-        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
-        if model.eq_type[e] == kinds.mjEQ_JOINT:
-            tied = ends[0] in ids and ends[1] in [*ids, -1]
-        elif model.eq_type[e] in of_bodies:
-            of_sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
-            one, other = model.site_bodyid[ends] if of_sites else ends
-            tied = paths[one] != paths[other]
-        else:
-            tied = False
-        found += [_name(model, mujoco.mjtObj.mjOBJ_EQUALITY, int(e))] * tied
+        ends, kind = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])], kinds(model.eq_type[e])
+        of, tied = objects.mjOBJ_BODY, False
+        if kind == kinds.mjEQ_JOINT:
+            of, tied = objects.mjOBJ_JOINT, ends[0] in ids and ends[1] in [*ids, -1]
+        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            if model.eq_objtype[e] == objects.mjOBJ_SITE:
+                ends = model.site_bodyid[ends].tolist()
+            tied = paths[ends[0]] != paths[ends[1]]
+        if tied:
+            named = " and ".join(_name(model, of, i) for i in ends if i >= 0)
+            name = _name(model, objects.mjOBJ_EQUALITY, int(e))
+            found.append(f"{name} ({kind.name[5:].lower()} of {named})")
     return found
 
 
