@@ -230,21 +230,16 @@ class Unknowns:
             rows = body.regressor(motion) if rigid is None else rigid
             result[:, :, of_bodies] = rows @ self._directions
         signs = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
+        parts = {"armature": motion.accelerations, "damping": motion.velocities}
+        parts["frictionloss"] = signs
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
             friction += model.dof_frictionloss[body.dofs] * signs
-            torques = body.torques(motion, rows) + friction
+            parts["gear"] = -(body.torques(motion, rows) + friction)
         for i, one in enumerate(self.parameters):
-            if one.kind not in OF_JOINTS:
-                continue
-            k = body.joints.index(one.place)
-            if one.kind == "gear":
-                result[:, k, i] = -torques[:, k]
-            elif one.kind == "frictionloss":
-                result[:, k, i] = signs[:, k]
-            else:
-                moved = motion.accelerations if one.kind == "armature" else motion.velocities
-                result[:, k, i] = moved[:, k]
+            if one.kind in OF_JOINTS:
+                k = body.joints.index(one.place)
+                result[:, k, i] = parts[one.kind][:, k]
         return result * self.scales
 
     def _inertial_directions(self) -> Array:
