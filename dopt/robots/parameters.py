@@ -104,6 +104,9 @@ class Unknowns:
     ----------
     parameters : tuple of Parameter
         The p parameters.
+    names : tuple of str
+    values, scales : (p,)
+        Nominal values, and the sizes that errors are relative to.
 
     Raises
     ------
@@ -125,23 +128,12 @@ class Unknowns:
                 f"no unknown parameter is given, but at least one is expected: give some of "
                 f"{', '.join([*OF_BODIES, *OF_JOINTS])}."
             )
-        self.parameters = tuple(found.values())
+        self.parameters, self.names = tuple(found.values()), tuple(found)
+        self.values, self.scales = np.array([(one.value, one.scale) for one in found.values()]).T
         self._directions = self._inertial_directions()
 
     def __len__(self) -> int:
         return len(self.parameters)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(one.name for one in self.parameters)
-
-    @property
-    def scales(self) -> Array:
-        return np.array([one.scale for one in self.parameters])
-
-    @property
-    def values(self) -> Array:
-        return np.array([one.value for one in self.parameters])
 
     def at(self, values: Array) -> tuple[Unknowns, Array]:
         """Return these parameters at other values, (p,), of the same scales, and the gears, (n,).
@@ -240,7 +232,7 @@ class Unknowns:
             if one.kind in OF_JOINTS:
                 k = body.joints.index(one.place)
                 result[:, k, i] = parts[one.kind][:, k]
-        return result * self.scales
+        return np.asarray(result * self.scales)
 
     def _inertial_directions(self) -> Array:
         """Return derivatives of the inertial parameters by unknowns of bodies, (10 · bodies, k).

@@ -166,9 +166,7 @@ class Ladder(Family):
     the side that has more room, and ends where the room does.
     """
 
-    @property
-    def name(self) -> str:
-        return "ladder"
+    name = "ladder"
 
     @property
     def segments(self) -> int:
@@ -229,21 +227,19 @@ class Spline(Family):
 
     def basis(self, dt: float) -> tuple[csr_array, ...]:
         """Return positions, velocities and accelerations by the control points, (T, m) each."""
-        t, knots = self._times(dt), self._step * np.arange(-3.0, self._count + 7.0)
+        step = self.seconds / (self._count + 3)
+        t, knots = self._times(dt), step * np.arange(-3.0, self._count + 7.0)
         inner = knots, knots[1:-1], knots[2:-2]
         degrees = zip(inner, (3, 2, 1), self._controls(), strict=True)
         return tuple(BSpline.design_matrix(t, one, k) @ of for one, k, of in degrees)
 
-    @property
-    def _step(self) -> float:
-        return self.seconds / (self._count + 3)
-
     def _controls(self) -> tuple[csr_array, csr_array, csr_array]:
         """Return all control points, and rates between them, (m + 6, m), (m + 5, m), (m + 4, m)."""
         rows, last = np.arange(self._count + 6), self._count - 1
+        step = self.seconds / (self._count + 3)
         points: csr_array = csr_array((np.ones(len(rows)), (rows, np.clip(rows - 3, 0, last))))
-        first = (points[1:] - points[:-1]) / self._step
-        return points, first, (first[1:] - first[:-1]) / self._step
+        first = (points[1:] - points[:-1]) / step
+        return points, first, (first[1:] - first[:-1]) / step
 
     def shortened(self, numbers: Array, reach: float) -> Array:
         """Return the numbers of a motion that reaches as far as some do with a share of it."""

@@ -75,13 +75,9 @@ class Trace:
 
     def measure(self, robot: SimulatedRobot, torque: Array) -> None:
         """Note the shares of the limits."""
-        limits = robot.limits
-        half = np.diff(limits.position, axis=1)[:, 0] / 2.0
-        taken = {
-            "position": (robot.q - limits.middle) / half,
-            "velocity": robot.v / limits.velocity,
-            "torque": torque / limits.torque,
-        }
+        state = Motion(CONTROL, robot.q, robot.v, 0.0 * robot.v)
+        taken = robot.limits.parts(state, torque)
+        del taken["acceleration"]
         for kind, share in taken.items():
             self.shares[kind] = max(self.shares.get(kind, 0.0), float(np.abs(share).max()))
 
