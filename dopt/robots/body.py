@@ -462,11 +462,16 @@ def point(mass: float, moment: Array, least: float = 0.0) -> Array:
 
 
 def hang(model: mujoco.MjModel, b: int, added: Array) -> None:
-    """Add inertial parameters, (10,), to a body of a model; without mass, it stays as it is."""
+    """Add inertial parameters, (10,), to a body of a model; without mass, it stays as it is.
+
+    Its centre comes no farther than its radius of gyration, as of estimates that do not fit.
+    """
     m, *rest = inertial(model, [b]) + added
     if m <= 0.0:
         return
     c, (x, y, z) = np.array(rest[:3]) / m, rest[6:]
+    reach = np.sqrt(max(sum(rest[3:6]), 0.0) / (2.0 * m))
+    c *= min(1.0, reach / max(float(np.linalg.norm(c)), 1e-12))
     about = np.diag(rest[3:6]) + np.array([[0.0, x, y], [x, 0.0, z], [y, z, 0.0]])
     moments, axes = np.linalg.eigh(about - m * (c @ c * np.eye(3) - np.outer(c, c)))
     model.body_mass[b], model.body_ipos[b] = m, c

@@ -540,7 +540,8 @@ class RobotExplorer:
         load = np.zeros(10)
         for _ in range(3):  # its inertia follows from its mass and moment
             mass, *moment = inverse @ led.T @ (wanted[:, 0] - turned @ load[4:])
-            mass = max(float(mass), -0.9 * float(model.body_mass[last]))
+            own, now = self.body.model.body_mass[last], model.body_mass[last]
+            mass = max(float(mass), float(0.1 * own - now))
             load = point(mass, np.array(moment), error)
         hang(model, last, load)
         learner.forget(10.0)
@@ -551,7 +552,7 @@ class RobotExplorer:
             f"{load[1:4].round(3)} kg m"
         )
         self._recent.clear()
-        self.payload, self._lifted, self._since = (load[:4], unsure), None, 0
+        self.payload, self._lifted, self._since = (load[:4], unsure), None, 2 * RECENT
 
     def _say(self, text: str) -> None:
         self.warnings.append(text)

@@ -223,6 +223,10 @@ def test_a_frame_without_mass_can_be_the_last_body() -> None:
     known = wrist(0.0033, 1.0)[1].known
     hang(known.model, 2, point(0.0, np.ones(3), 1.0))  # once that made torques NaN
     np.testing.assert_allclose(known.inverse(*np.zeros((2, 1)), np.ones(1)), 0.0033)
+    centre = np.array([0.1, 0.0, 0.0])
+    for mass, moment in ((0.5, 0.5 * centre), (-0.49997, 0.003 - 0.5 * centre)):
+        hang(known.model, 2, point(mass, moment))  # what is left once had 0.6 kg m²
+    assert known.inverse(*np.zeros((2, 1)), np.ones(1)) < 0.005
 
 
 def test_references_keep_their_limits_exactly() -> None:
@@ -327,6 +331,20 @@ def test_a_payload_is_noticed_said_once_and_weighed() -> None:
     assert "payload" in explorer.warnings[0]
     assert explorer.known.model.body_mass[body.moved[-1]] - own == pytest.approx(0.8, abs=0.15)
     assert body.model.body_mass[body.moved[-1]] == own
+
+
+def test_a_payload_that_is_put_down_soon_is_noticed_too() -> None:
+    """Once friction had learned of it by the time that changes were looked for again."""
+    for seed in range(2):
+        robot, explorer = pair(seed, jaco, payload=(6.0, 0.5))
+        body, last = robot.body, robot.body.moved[-1]
+        explore(robot, explorer, 12.0)
+        assert explorer.counts["changed"] == 1
+        hang(robot._model, last, -robot.ball(0.5))
+        explore(robot, explorer, 6.0)
+        assert explorer.counts["changed"] == 2
+        left = explorer.known.model.body_mass[last] - body.model.body_mass[last]
+        assert left == pytest.approx(0.0, abs=0.1)
 
 
 def test_standard_errors_of_payloads_hold() -> None:
