@@ -186,8 +186,7 @@ class Body:
         positions = (model.key_qpos[0] if model.nkey else model.qpos0)[self.addresses]
         low, high = model.jnt_range[self._ids].T
         outside = model.jnt_limited[self._ids] & ((positions < low) | (positions > high))
-        result: Array = np.where(outside, (low + high) / 2.0, positions)
-        return result
+        return np.asarray(np.where(outside, (low + high) / 2.0, positions))
 
     @property
     def ranges(self) -> Array:
@@ -195,8 +194,7 @@ class Body:
         limited = self.model.jnt_limited[self._ids].astype(bool)
         free = np.where(self.model.jnt_type[self._ids] == HINGE, np.pi, 0.5)
         around = self.home[:, None] + free[:, None] * [-1.0, 1.0]
-        result: Array = np.where(limited[:, None], self.model.jnt_range[self._ids], around)
-        return result
+        return np.asarray(np.where(limited[:, None], self.model.jnt_range[self._ids], around))
 
     def regressor(self, motion: Motion) -> Array:
         """Return how torques depend on the inertial parameters, (T, n, 10 · bodies).
@@ -225,8 +223,8 @@ class Body:
             states = zip(motion.positions, motion.velocities, motion.accelerations, strict=True)
             return np.array([self._known.inverse(*state) for state in states])
         rows = self.regressor(motion) if regressor is None else regressor
-        result: Array = rows @ self.inertial + model.dof_armature[self.dofs] * motion.accelerations
-        return result
+        rotors = model.dof_armature[self.dofs] * motion.accelerations
+        return np.asarray(rows @ self.inertial + rotors)
 
     def columns(self, motion: Motion) -> dict[str, Array]:
         """Return time, q, dq, ddq and tau of each joint, such as ``q_elbow``, each (T,).
@@ -313,7 +311,6 @@ class KnownBody:
         if hasattr(self.model, "dof_dampingpoly"):
             self.model.dof_dampingpoly[:] = 0.0
         self._data = mujoco.MjData(self.model)
-        self._unit, self._column = np.zeros(self.model.nv), np.zeros(self.model.nv)
 
     def inverse(self, q: Array, v: Array, a: Array) -> Array:
         """Return the torques [N m], (n,), that accelerate the body so."""
@@ -327,32 +324,14 @@ class KnownBody:
     def mass_matrix(self) -> Array:
         """Return M, (n, n), at the position of the last call of :meth:`inverse`."""
         dofs = self.body.dofs
-        M = np.empty((len(dofs), len(dofs)))
-        for k, dof in enumerate(dofs):
-            self._unit[dof] = 1.0
-            self._engine.mj_mulM(self.model, self._data, self._column, self._unit)
-            self._unit[dof] = 0.0
-            M[k] = self._column[dofs]
-        return M
+        M = np.zeros((len(dofs), self.model.nv))
+        for column, unit in zip(M, np.eye(self.model.nv)[dofs], strict=True):
+            self._engine.mj_mulM(self.model, self._data, column, unit)
+        return M[:, dofs]
 
     def apparent_inertia(self) -> Array:
         """Return the inertia of each joint while the others are free, (n,), where M is."""
-        result: Array = 1.0 / np.diag(np.linalg.inv(self.mass_matrix()))
-        return result
-
-    def hang(self, mass: float, moment: Array) -> None:
-        """Add a point mass [kg] to the last moved body, by its first moment [kg m], (3,)."""
-        model, last = self.model, self.body.moved[-1]
-        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
-        total = own + mass
-        if total <= 0.0:  # of a frame without mass, from which none can be taken
-            return
-        model.body_mass[last] = total
-        model.body_ipos[last] = (own * centre + moment) / total
-        if mass > 0.0:
-            away = moment / mass - centre
-            model.body_inertia[last] += own * mass / total * (away @ away)
-        self._engine.mj_setConst(model, self._data)
+        return 1.0 / np.diag(np.linalg.inv(self.mass_matrix()))
 
 
 class Contacts:
@@ -387,9 +366,8 @@ class Contacts:
         for a, b in (pairs.T, pairs.T[::-1]):
             np.minimum.at(self._kept, (a, b), at_home)
         self.touching = self._touching(body.home)
-        self.always, random = set(self.touching), np.random.default_rng(0)
-        low, high = body.ranges.T
-        for q in low + (high - low) * random.random((ANYWHERE * bool(self.always), body.n)):
+        self.always = set(self.touching)
+        for q in poses(body.ranges, ANYWHERE * bool(self.always)):
             self.always &= self._touching(q)
         for a, b in self.always:
             self._kept[a, b] = self._kept[b, a] = -np.inf
@@ -441,20 +419,25 @@ class Contacts:
 
         The largest over 200 random positions within limits, (n, 2).
         """
-        model, random, (low, high) = self._model, np.random.default_rng(0), limits.T
+        model = self._model
         reach, turns = np.zeros(model.nv), np.zeros((2, 3, model.nv))
-        for q in low + (high - low) * random.random((200, len(limits))):
+        for q in poses(limits, 200):
             self._pass(q)
             for geom, radius in enumerate(model.geom_rbound):
                 self._engine.mj_jacGeom(model, self._data, *turns, geom)
                 sizes = np.linalg.norm(turns, axis=1)
                 reach = np.maximum(reach, sizes[0] + radius * sizes[1])
-        result: Array = reach[self._body.dofs]
-        return result
+        return np.asarray(reach[self._body.dofs])
 
 
 HINGE, SLIDE = 3, 2
 """Types of joints of MuJoCo."""
+
+
+def poses(ranges: Array, count: int) -> Array:
+    """Return random positions, (count, n), within ranges, (n, 2): always the same."""
+    low, high = ranges.T
+    return np.asarray(low + (high - low) * np.random.default_rng(0).random((count, len(ranges))))
 
 
 def inertial(model: mujoco.MjModel, bodies: Sequence[int]) -> Array:
@@ -466,6 +449,44 @@ def inertial(model: mujoco.MjModel, bodies: Sequence[int]) -> Array:
         about = about_com + m * (c @ c * np.eye(3) - np.outer(c, c))
         rows.append([m, *(m * c), *np.diag(about), *about[np.triu_indices(3, 1)]])
     return np.concatenate(rows)
+
+
+def point(mass: float, moment: Array, least: float = 0.0) -> Array:
+    """Return the inertial parameters of a point mass, (10,), by its first moment, (3,).
+
+    Its inertia is by a mass of the magnitude ``least`` where it has less.
+    """
+    spread = moment @ moment * np.eye(3) - np.outer(moment, moment)
+    about = spread / np.copysign(max(abs(mass), least), mass)
+    return np.array([mass, *moment, *np.diag(about), *about[np.triu_indices(3, 1)]])
+
+
+def hang(model: mujoco.MjModel, b: int, added: Array) -> None:
+    """Add inertial parameters, (10,), to a body of a model; without mass, it stays as it is.
+
+    Its centre comes no farther than its radius of gyration, as of estimates that do not fit.
+    """
+    m, *rest = inertial(model, [b]) + added
+    if m <= 0.0:
+        return
+    c, (x, y, z) = np.array(rest[:3]) / m, rest[6:]
+    reach = np.sqrt(max(sum(rest[3:6]), 0.0) / (2.0 * m))
+    c *= min(1.0, reach / max(float(np.linalg.norm(c)), 1e-12))
+    about = np.diag(rest[3:6]) + np.array([[0.0, x, y], [x, 0.0, z], [y, z, 0.0]])
+    moments, axes = np.linalg.eigh(about - m * (c @ c * np.eye(3) - np.outer(c, c)))
+    model.body_mass[b], model.body_ipos[b] = m, c
+    model.body_inertia[b] = np.maximum(moments, 0.01 * model.body_inertia[b].min())
+    turn = Rotation.from_matrix(np.linalg.det(axes) * axes)
+    model.body_iquat[b] = turn.as_quat(scalar_first=True)
+    settle(model)
+
+
+def settle(model: mujoco.MjModel) -> None:
+    """Let a model take changed inertias: no short cuts for centres at 0 and constant ones."""
+    import mujoco
+
+    model.body_sameframe[:] = model.body_simple[:] = model.dof_simplenum[:] = 0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _pseudo_inertias() -> Array:
@@ -499,8 +520,7 @@ def _twist(model: mujoco.MjModel, j: int) -> Array:
 
 def rotation(quaternion: Array) -> Array:
     """Return the rotation of a unit quaternion (w, x, y, z), (3, 3)."""
-    result: Array = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    return result
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 def _effective(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -558,19 +578,20 @@ def _closed(model: mujoco.MjModel, ids: list[int], paths: list[list[int]]) -> li
     """Return the equality constraints that some motion of the driven joints alone breaks."""
     import mujoco
 
-    kinds, found = mujoco.mjtEq, list[str]()
-    of_bodies = int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)
+    kinds, objects, found = mujoco.mjtEq, mujoco.mjtObj, list[str]()
     for e in np.flatnonzero(model.eq_active0):
-        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
-        if model.eq_type[e] == kinds.mjEQ_JOINT:
-            tied = ends[0] in ids and ends[1] in [*ids, -1]
-        elif model.eq_type[e] in of_bodies:
-            of_sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
-            one, other = model.site_bodyid[ends] if of_sites else ends
-            tied = paths[one] != paths[other]
-        else:
-            tied = False
-        found += [_name(model, mujoco.mjtObj.mjOBJ_EQUALITY, int(e))] * tied
+        ends, kind = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])], kinds(model.eq_type[e])
+        of, tied = objects.mjOBJ_BODY, False
+        if kind == kinds.mjEQ_JOINT:
+            of, tied = objects.mjOBJ_JOINT, ends[0] in ids and ends[1] in [*ids, -1]
+        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            if model.eq_objtype[e] == objects.mjOBJ_SITE:
+                ends = model.site_bodyid[ends].tolist()
+            tied = paths[ends[0]] != paths[ends[1]]
+        if tied:
+            named = " and ".join(_name(model, of, i) for i in ends if i >= 0)
+            name = _name(model, objects.mjOBJ_EQUALITY, int(e))
+            found.append(f"{name} ({kind.name[5:].lower()} of {named})")
     return found
 
 

@@ -155,7 +155,9 @@ class Problem:
         values, least = self.unknowns.values, LEAST * self.unknowns.scales
         self.tangent, _ = self.unknowns.at(np.copysign(np.maximum(abs(values), least), values))
         self.count = len(asked)
-        self._friction = _friction(body, limits)
+        dry, viscous = body.model.dof_frictionloss[body.dofs], body.model.dof_damping[body.dofs]
+        typical = np.where(dry + viscous > 0.0, dry, 0.1 * limits.torque)
+        self._friction = typical, viscous
         self.reference = np.ones(self.count)
 
     @property
@@ -189,8 +191,7 @@ class Problem:
         rates, (dry, viscous) = motion.velocities, self._friction
         friction = dry * np.tanh(rates / (0.01 * self.limits.velocity)) + viscous * rates
         shares = np.abs(self.body.torques(motion, rigid) + friction) / self.limits.torque
-        result: Array = shares.max(axis=0)
-        return result
+        return np.asarray(shares.max(axis=0))
 
     def candidate(self, family: Family, numbers: Array) -> Candidate:
         """Return a motion with what it tells; its share is not known yet.
@@ -228,12 +229,6 @@ class Problem:
     def checked(self, one: Candidate) -> Candidate:
         """Return a candidate, broken only if something stands against it at finer steps."""
         return dataclasses.replace(one, broken=float(bool(self.obstacle(one))))
-
-
-def _friction(body: Body, limits: Limits) -> tuple[Array, Array]:
-    """Return dry and viscous friction of each joint, (n,); where it has none, typical dry one."""
-    dry, viscous = body.model.dof_frictionloss[body.dofs], body.model.dof_damping[body.dofs]
-    return np.where(dry + viscous > 0.0, dry, 0.1 * limits.torque), viscous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -450,8 +445,7 @@ def _by_information(information: Array, s: int) -> Array:
 
 def _values(rows: Array, weights: Array) -> Array:
     """Return the weight of what each state tells, (N,), of its rows, (N, n, p)."""
-    result: Array = np.einsum("tjp,tjp->t", rows @ weights, rows)
-    return result
+    return np.asarray(np.einsum("tjp,tjp->t", rows @ weights, rows))
 
 
 def _states(problem: Problem, rng: np.random.Generator) -> Motion:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import time as clock
@@ -16,8 +17,8 @@ from scipy.stats import chi2
 
 from dopt import arguments
 from dopt.errors import ExplorationError, SpecificationError, unknown_name
-from dopt.robots.body import Body, KnownBody, Motion, listed
-from dopt.robots.friction import BATCH, RIPPLE, SPEEDS, CoulombViscous, FrictionLearner, window_size
+from dopt.robots.body import Body, KnownBody, Motion, hang, listed, point
+from dopt.robots.friction import RIPPLE, SPEEDS, CoulombViscous, FrictionLearner, window_size
 from dopt.robots.limits import Limits
 from dopt.robots.tracking import Guard, Tracker, possible_acceleration
 from dopt.sphere import sphere_maximizer
@@ -120,6 +121,12 @@ class RobotExplorer:
         Radius of the ball ‖u/limit‖ ≤ γ of torques.
     seed : int
 
+    Attributes
+    ----------
+    payload : (4,) and (4, 4), or None
+        Mass [kg] and first moment [kg m] that the last body carries since the torques changed last,
+        and their covariance.
+
     Raises
     ------
     SpecificationError
@@ -185,8 +192,8 @@ class RobotExplorer:
         self.steps, self._wrong, self._asked = 0, 0, False
         self._rows: list[tuple[Array, ...]] = []
         self._recent: deque[tuple[Any, ...]] = deque(maxlen=RECENT)
-        self._unsure: Array | None = None  # covariance of the payload's mass and first moment
-        self._payload: list[tuple[Any, ...]] | None = None
+        self.payload: tuple[Array, Array] | None = None
+        self._lifted: list[tuple[Any, ...]] | None = None
         self._since = 0  # windows since the body was last known to change
         self._done = False
         self._due: float | None = None
@@ -268,10 +275,12 @@ class RobotExplorer:
         self.known.inverse(measured, self._v, self._v)
         surge = SURGE * self.dt * self.limits.torque / self.known.apparent_inertia()
         self._ahead = surge / self.limits.velocity
-        if light := [self.body.joints[j] for j in np.flatnonzero(self._ahead > 1.0)]:
+        slow = np.flatnonzero(AHEAD * self._ahead > 1.0 - CREEP)
+        if light := [self.body.joints[j] for j in slow]:
             self._say(
                 f"within {1e3 * self.dt:g} ms, {100.0 * SURGE:g} % of the limit of torque turns "
-                f"{listed(light)} as fast as it may: give the armature in the robot's file"
+                f"{listed(light)} so fast that references begin with {100.0 * CREEP:g} % of the "
+                f"limit of velocity: give the armature in the robot's file"
             )
 
     def _check_time(self, time: float | None) -> None:
@@ -337,8 +346,7 @@ class RobotExplorer:
         """Return which joints, (n,), braking from now, come to rest beyond where they may go."""
         rest = q + v * np.abs(v) / (2.0 * self.acceleration)
         above, below = (rest > self._high) & (v > 0.0), (rest < self._low) & (v < 0.0)
-        result: npt.NDArray[np.bool_] = above | below
-        return result
+        return np.asarray(above | below)
 
     def _pace(self) -> None:
         """Leave room between references and limits of velocity for rates that run ahead."""
@@ -451,23 +459,25 @@ class RobotExplorer:
                 f"{listed(still)} did not move fast enough to learn from in {STILL:g} s: give the "
                 f"armature in the robot's file, or look whether something holds it"
             )
-        if self._payload is not None:
-            self._payload.append((means, rates))
-            if len(self._payload) >= max(2 * RECENT, LIFTED / self.learner.window.seconds):
-                self._lift(self._payload)
+        if self._lifted is not None:
+            self._lifted.append((means, rates))
+            if len(self._lifted) >= max(2 * RECENT, LIFTED / self.learner.window.seconds):
+                self._lift(self._lifted)
             return
-        before = self.learner.feedforward(self._v)
+        before, kept = self.learner.feedforward(self._v), copy.copy(self.learner)
         standard = self.learner.learn(means, rates)
         wide = np.sqrt(self.learner.inflation)
-        self._recent.append((standard / wide, self.learner.unit * wide, means))
+        self._recent.append((standard / wide, self.learner.unit * wide, means, kept))
+        if changed := self._changed():  # what was compared has taught of the payload, too
+            self.learner.restore(self._recent[0][3])
         self._q = self._q - self._tracker.lag(self.learner.feedforward(self._v) - before)
-        if self._changed():
+        if changed:
             self.counts["changed"] += 1
             self._say(
                 f"after {self.steps * self.dt:.2f} s the torques no longer fit the body and the "
                 f"friction learned: a payload is estimated, and friction learned again"
             )
-            self._payload = []
+            self._lifted = []
             self._done = False
         elif self.stop and self.counts["windows"] % 5 == 0:
             self._done = self._reached()
@@ -485,62 +495,64 @@ class RobotExplorer:
         known = np.isfinite(standard)
         size = np.sqrt(np.maximum(known.sum(axis=0), 1))
         sums = np.where(known, standard, 0.0).sum(axis=0) / size
-        if self._unsure is None or sums @ sums <= self._alarm:
+        if self.payload is None or sums @ sums <= self._alarm:
             return bool(sums @ sums > self._alarm)
         # What a payload that was weighed may weigh more or less is no change.
-        rows = self._carried([row[2] for row in self._recent]) * (known / unit)[..., None]
+        rows = self._carried([row[2] for row in self._recent])[..., :4]
+        rows = rows * (known / unit)[..., None]
         rows = rows.sum(axis=0) / size[:, None]
-        spread = np.eye(len(sums)) + rows @ self._unsure @ rows.T
+        spread = np.eye(len(sums)) + rows @ self.payload[1] @ rows.T
         return bool(sums @ np.linalg.solve(spread, sums) > self._alarm)
 
-    def _led(self, means: tuple[Array, ...], rates: Array | None) -> tuple[Array, ...]:
+    def _led(self, means: tuple[Array, ...], rates: Array) -> tuple[Array, ...]:
         """Return position, rate and acceleration as references give them: free of noise."""
-        if rates is None:
-            return means
         way = self.dt * np.cumsum(np.vstack([0.0 * rates[:1], rates]), axis=0)
         return means[0], *self.learner.window.means(way, way)[1:3]
 
     def _carried(self, windows: list[tuple[Array, ...]]) -> Array:
-        """Return torques by mass and first moment on the last body, (k, n, 4), parts of limits."""
+        """Return torques by what is added to the last body, (k, n, 10), parts of limits."""
         q, v, a = (np.array([means[i] for means in windows]) for i in range(3))
-        rows = self.body.regressor(Motion(self.learner.window.seconds, q, v, a))[:, :, -10:-6]
+        rows = self.body.regressor(Motion(self.learner.window.seconds, q, v, a))[..., -10:]
         return rows / self.limits.torque[:, None]
 
     def _lift(self, windows: list[tuple[Any, ...]]) -> None:
         """Estimate mass and centre of what the last body carries, and add them to it.
 
-        By least squares, with friction and ripple as unsure as they are. Its rows are of
-        the references: noise of torques accelerates, and would look like less mass.
+        By least squares for a point mass, with friction and ripple as unsure as they are. Rows of
+        references are the instruments: noise of torques accelerates, and would look like less mass.
         """
         learner, stacks = self.learner, []
         pairs = zip(*(learner.innovations(*window)[:2] for window in windows), strict=True)
         missing, friction = map(np.array, pairs)
-        rows = self._carried([self._led(*window) for window in windows])
+        rows = self._carried([means for means, _ in windows])
+        led = self._carried([self._led(*window) for window in windows])[..., :4]
         for j, unit in enumerate(learner.noise):
             seen = np.isfinite(missing[:, j])
             H = friction[seen, j]
             root = np.linalg.cholesky(np.eye(len(H)) + H @ learner.covariance[j] @ H.T)
-            parts = np.column_stack([rows[seen, j], missing[seen, j]]) / unit
+            parts = np.column_stack([missing[seen, j], led[seen, j], rows[seen, j]]) / unit
             stacks.append(np.linalg.solve(root, parts))
-        design, wanted = np.split(np.concatenate(stacks), [4], axis=1)
+        wanted, led, near, turned = np.split(np.concatenate(stacks), [1, 5, 9], axis=1)
         prior = np.eye(4) / self.body.model.body_mass.sum() ** 2
-        found = np.linalg.solve(design.T @ design + prior, design.T @ wanted)
-        rest = wanted - design @ found
-        batches = rest[: len(rest) // BATCH * BATCH].reshape(-1, BATCH).sum(axis=1)
-        misfit = max(1.0, (batches**2).sum() / max(len(batches), 1) / BATCH)
-        self._unsure = np.linalg.inv(design.T @ design / misfit + prior)
-        found = found[:, 0]
-        mass = max(float(found[0]), -0.9 * float(self.known.model.body_mass[self.body.moved[-1]]))
-        self.known.hang(mass, found[1:])
+        inverse = np.linalg.inv(led.T @ near + prior)
+        unsure = inverse @ (led.T @ led + prior) @ inverse.T
+        error, model, last = math.sqrt(unsure[0, 0]), self.known.model, self.body.moved[-1]
+        load = np.zeros(10)
+        for _ in range(3):  # its inertia follows from its mass and moment
+            mass, *moment = inverse @ led.T @ (wanted[:, 0] - turned @ load[4:])
+            own, now = self.body.model.body_mass[last], model.body_mass[last]
+            mass = max(float(mass), float(0.1 * own - now))
+            load = point(mass, np.array(moment), error)
+        hang(model, last, load)
         learner.forget(10.0)
-        moment, error = found[1:].round(3), math.sqrt(self._unsure[0, 0])
-        unsure = ", which these motions hardly tell from its lever and from friction"
+        hardly = ", which these motions hardly tell from its lever and from friction"
         self._say(
             f"the last body carries {mass:+.3f} kg more (standard error {error:.2g} kg"
-            f"{unsure * (error > UNTOLD * abs(mass))}), whose first moment is {moment} kg m"
+            f"{hardly * (error > UNTOLD * abs(mass))}), whose first moment is "
+            f"{load[1:4].round(3)} kg m"
         )
         self._recent.clear()
-        self._payload, self._since = None, 0
+        self.payload, self._lifted, self._since = (load[:4], unsure), None, 2 * RECENT
 
     def _say(self, text: str) -> None:
         self.warnings.append(text)
@@ -599,5 +611,4 @@ def _mean_features(start: Array, end: Array) -> Array:
     """Return the means of the features of ripple between positions, each (k,), (k, 62)."""
     a, b = start[:, None] * RIPPLE, end[:, None] * RIPPLE
     cosines, sines = np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)
-    result: Array = np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2)
-    return result
+    return np.asarray(np.concatenate([cosines, sines], axis=1) / np.tile(b - a, 2))

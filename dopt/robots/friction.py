@@ -17,8 +17,7 @@ the intervals hold.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import brentq
@@ -68,36 +67,21 @@ SIGN = 0.003
 """Width in which dry friction is taken to change its sign."""
 
 
-class FrictionModel(Protocol):
-    """Friction of n joints with p parameters each; rates and torques as parts of the limits."""
-
-    start: Array
-    """Parameters before any sample, (n, p)."""
-    spread: Array
-    """Their standard deviations, (p,)."""
-
-    def torques(self, parameters: Array, x: Array) -> Array:
-        """Return f at rates (n, k), (n, k)."""
-
-    def jacobian(self, parameters: Array, x: Array) -> Array:
-        """Return J = ∂f/∂θ, (n, k, p)."""
-
-
 class CoulombViscous:
     """Coulomb and viscous friction, and Stribeck terms of fixed widths: linear in its parameters.
 
     The parameters are the Coulomb torque, the viscous torque at the velocity limit, and heights.
+    They begin at ``start``, (n, p), with standard deviations ``spread``, (p,); rates x are (n, k).
     """
 
     widths = np.array([0.015, 0.03, 0.06])
     spread = np.array([0.1, 0.1, 0.015, 0.015, 0.015])
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, seed: int = 0) -> None:  # noqa: ARG002  # zeros for any seed
         self.start = np.zeros((n, len(self.spread)))
 
     def torques(self, parameters: Array, x: Array) -> Array:
-        result: Array = np.einsum("nkp,np->nk", self.jacobian(parameters, x), parameters)
-        return result
+        return np.asarray(np.einsum("nkp,np->nk", self.jacobian(parameters, x), parameters))
 
     def jacobian(self, parameters: Array, x: Array) -> Array:  # noqa: ARG002  # linear in them
         sign = np.tanh(x / SIGN)
@@ -123,8 +107,7 @@ class Network:
 
     def torques(self, parameters: Array, x: Array) -> Array:
         t = self.jacobian(parameters, x)[..., :7]
-        result: Array = (parameters[:, None, :7] * t).sum(axis=2) + parameters[:, 21:]
-        return result
+        return np.asarray((parameters[:, None, :7] * t).sum(axis=2) + parameters[:, 21:])
 
     def jacobian(self, parameters: Array, x: Array) -> Array:
         c, s = parameters[:, None, :7], np.exp(parameters[:, None, 7:14])
@@ -133,10 +116,8 @@ class Network:
         return np.concatenate([t, bent * s * x[..., None], bent, np.ones((*x.shape, 1))], axis=2)
 
 
-FRICTION: Mapping[str, Callable[[int, int], FrictionModel]] = {
-    "coulomb_viscous": lambda n, _: CoulombViscous(n),
-    "network": Network,
-}
+FRICTION: dict[str, type[CoulombViscous | Network]]
+FRICTION = {"coulomb_viscous": CoulombViscous, "network": Network}
 """Models of friction, by their names, of n joints and a seed."""
 
 
@@ -184,7 +165,7 @@ class FrictionLearner:
             raise unknown_name("friction", friction, FRICTION)
         n = len(limits.torque)
         self.limits, self.window, self._inverse = limits, Window(dt, window), inverse
-        self.model: FrictionModel = FRICTION[friction](n, seed)
+        self.model = FRICTION[friction](n, seed)
         self.n, self.p = n, self.model.start.shape[1]
         spread = self.model.spread / NOISE
         ripple = np.full(2 * len(RIPPLE), RIPPLE_SIZE / math.sqrt(len(RIPPLE)))
@@ -200,20 +181,17 @@ class FrictionLearner:
     @property
     def noise(self) -> Array:
         """Standard deviation of a window's torque, (n,), as a part of the limit."""
-        result: Array = np.sqrt(self._squares[0] / self._squares[1])
-        return result
+        return np.asarray(np.sqrt(self._squares[0] / self._squares[1]))
 
     @property
     def inflation(self) -> Array:
         """Variance of means of innovations relative to uncorrelated ones, (n,), at least 1."""
-        result: Array = np.maximum(1.0, self._batches[0] / self._batches[1])
-        return result
+        return np.asarray(np.maximum(1.0, self._batches[0] / self._batches[1]))
 
     def torques(self, velocities: Array) -> Array:
         """Return friction as it was learned [N m], (n,), at velocities (n,)."""
         x = (velocities / self.limits.velocity)[:, None]
-        result: Array = self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
-        return result
+        return self.model.torques(self.mean[:, : self.p], x)[:, 0] * self.limits.torque
 
     def feedforward(self, velocities: Array) -> Array:
         """Return friction to feed forward [N m], (n,), at velocities (n,).
@@ -226,8 +204,7 @@ class FrictionLearner:
         rows = self.model.jacobian(parameters, x)
         variance = (rows @ self.covariance[:, : self.p, : self.p] * rows).sum(axis=(1, 2))
         size = np.abs(value) - self.noise * np.sqrt(np.maximum(variance, 0.0))
-        result: Array = np.sign(value) * np.maximum(size, 0.0) * self.limits.torque
-        return result
+        return np.asarray(np.sign(value) * np.maximum(size, 0.0) * self.limits.torque)
 
     def innovations(
         self, means: tuple[Array, Array, Array, Array], rates: Array | None = None
@@ -276,20 +253,26 @@ class FrictionLearner:
         self.unit = self.noise * np.sqrt(1.0 + variance)
         result = np.where(moving, standard / self.noise, np.nan)
         spread = self._spread(rows)
-        self.mean += spread * (error / (1.0 + variance))[:, None]
-        self.covariance -= spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
-        self._squares += np.where(moving, [standard**2, np.ones(self.n)], 0.0)
-        self._pending += np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
-        full = self._pending[1] >= BATCH
-        self._batches += np.where(full, [self._pending[0] ** 2 / BATCH, np.ones(self.n)], 0.0)
-        self._pending[:, full] = 0.0
-        self.windows += moving
+        # New arrays: a shallow copy keeps what was known before.
+        self.mean = self.mean + spread * (error / (1.0 + variance))[:, None]
+        taken = spread[:, :, None] * spread[:, None, :] / (1.0 + variance)[:, None, None]
+        self.covariance = self.covariance - taken
+        self._squares = self._squares + np.where(moving, [standard**2, np.ones(self.n)], 0.0)
+        pending = self._pending + np.where(moving, [np.nan_to_num(result), np.ones(self.n)], 0.0)
+        full = pending[1] >= BATCH
+        batch = np.where(full, [pending[0] ** 2 / BATCH, np.ones(self.n)], 0.0)
+        self._batches, self._pending = self._batches + batch, np.where(full, 0.0, pending)
+        self.windows = self.windows + moving
         return result
+
+    def restore(self, before: FrictionLearner) -> None:
+        """Return to an earlier shallow copy of this learner."""
+        vars(self).update(vars(before))
 
     def forget(self, factor: float) -> None:
         """Multiply the errors of friction: the body that it was learned with has changed."""
-        self.covariance[:, : self.p] *= factor
-        self.covariance[:, :, : self.p] *= factor
+        of = np.where(np.arange(self.mean.shape[1]) < self.p, factor, 1.0)
+        self.covariance = self.covariance * np.outer(of, of)
         self._expected = None
 
     def rows(self, speeds: Array) -> Array:
@@ -317,8 +300,7 @@ class FrictionLearner:
         block = self.covariance[:, : self.p, : self.p]
         variance = np.einsum("nkp,npq,nkq->nk", rows, block, rows)
         scale = self.noise * np.sqrt(self.inflation)
-        result: Array = np.sqrt(np.maximum(variance, 0.0)) * scale[:, None]
-        return result
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * scale[:, None])
 
     def intervals(self) -> tuple[Array, Array]:
         """Return values and half-widths as parts of the torque limit, each (n, 14).
@@ -330,8 +312,7 @@ class FrictionLearner:
 
     def sizes(self) -> Array:
         """Return the root mean square of each joint's curve, (n,), as a part of the limit."""
-        result: Array = np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1))
-        return result
+        return np.asarray(np.sqrt((self._values(SPEEDS)[:, :-2] ** 2).mean(axis=1)))
 
     def _information(self, errors: Array) -> Array | None:
         """Return the information expected at the stop, (n, 14), None until it is near.

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from dopt.arguments import finite, within
 from dopt.errors import SpecificationError, given_path, unknown_name
-from dopt.robots.body import Body, Motion, actuators, listed
+from dopt.robots.body import Body, Motion, actuators, listed, poses
 from dopt.types import Array
 
 KINDS = ("position", "velocity", "acceleration", "torque")
@@ -97,8 +98,7 @@ class Limits:
     @property
     def middle(self) -> Array:
         """Middle of the ranges of position, (n,)."""
-        result: Array = self.position.mean(axis=1)
-        return result
+        return np.asarray(self.position.mean(axis=1))
 
     def parts(self, motion: Motion, torques: Array | None = None) -> dict[str, Array]:
         """Return a motion as parts of each kind of limit, (T, n); 1 and -1 are the limits."""
@@ -118,8 +118,7 @@ class Limits:
 
 def check_weight(body: Body, limits: Limits) -> None:
     """Refuse limits of torque that hold the body at rest in none of many random positions."""
-    low, high = limits.position.T
-    q = low + (high - low) * np.random.default_rng(0).random((POSES, body.n))
+    q = poses(limits.position, POSES)
     weights = np.abs(body.torques(Motion(1.0, q, *np.zeros((2, *q.shape)))))
     shares = weights / limits.torque
     best = int(shares.max(axis=1).argmin())
@@ -186,11 +185,8 @@ def _torques(body: Body) -> Array:
         if model.actuator_forcelimited[a]:
             found[j] = min(found[j], abs(gear) * np.abs(model.actuator_forcerange[a]).min())
         plain = (model.actuator_gaintype[a], model.actuator_biastype[a]) == (0, 0)
-        if (
-            plain
-            and model.actuator_dyntype[a] != INTEGRATOR
-            and model.actuator_ctrllimited[control]
-        ):
+        plain &= model.actuator_dyntype[a] != INTEGRATOR
+        if plain and model.actuator_ctrllimited[control]:
             gain = abs(gear * model.actuator_gainprm[a, 0])
             found[j] = min(found[j], gain * np.abs(model.actuator_ctrlrange[control]).min())
     return found
@@ -219,31 +215,25 @@ def _given(body: Body, file: Path) -> dict[tuple[str, str], Any]:
         if name != "default" and name not in body.joints:
             raise unknown_name("joint", str(name), body.joints)
         if not isinstance(section, Mapping):
-            raise _unlike(source, str(name), section, "a mapping of limits")
+            raise _unlike(f"{name} in {source}", section, "a mapping of limits")
         for kind, value in section.items():
             if kind not in KINDS:
                 raise unknown_name(f"limit of joint '{name}'", str(kind), KINDS)
-            value = _checked(source, f"{name}.{kind}", value, kind == "position")
+            value = _checked(f"{name}.{kind} in {source}", value, kind == "position")
             for joint in body.joints if name == "default" else [str(name)]:
                 given[joint, kind] = value
     return given
 
 
-def _checked(source: Path, what: str, value: Any, is_range: bool) -> Any:
+def _checked(what: str, value: Any, is_range: bool) -> Any:
     """Return a positive number, or a range [low, high]; a number is the range about 0."""
-    if is_range and isinstance(value, int | float) and not isinstance(value, bool):
-        value = [-abs(value), abs(value)]
-    numbers = value if is_range and isinstance(value, list) else [value]
-    fine = all(
-        isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in numbers
-    )
-    if is_range:
-        if not fine or len(numbers) != 2 or numbers[0] >= numbers[1]:
-            raise _unlike(source, what, value, "[low, high]")
-        return [float(x) for x in numbers]
-    if not fine or numbers[0] <= 0:
-        raise _unlike(source, what, value, "a positive number")
-    return float(numbers[0])
+    if not is_range:
+        return within(what, value, math.inf)
+    ends = [-abs(value), abs(value)] if type(value) in (int, float) else value
+    low, high = finite(what, ends, 2).tolist()
+    if low >= high:
+        raise _unlike(what, value, "[low, high]")
+    return [low, high]
 
 
 def _suspicious(
@@ -287,7 +277,5 @@ def _beyond(own: Mapping[tuple[str, str], Any], values: Mapping[tuple[str, str],
     ]
 
 
-def _unlike(source: Path, what: str, value: object, expected: str) -> SpecificationError:
-    return SpecificationError(
-        f"{what} in {source} is {value!r}, but {expected} is expected: correct it."
-    )
+def _unlike(what: str, value: object, expected: str) -> SpecificationError:
+    return SpecificationError(f"{what} is {value!r}, but {expected} is expected: correct it.")

@@ -9,14 +9,15 @@ from __future__ import annotations
 import copy
 import dataclasses
 import fnmatch
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.optimize
+import scipy.linalg
 
 from dopt.errors import SpecificationError, unknown_name
-from dopt.robots.body import Body, Motion, inertial
+from dopt.robots.body import Body, Motion, inertial, settle
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -103,6 +104,9 @@ class Unknowns:
     ----------
     parameters : tuple of Parameter
         The p parameters.
+    names : tuple of str
+    values, scales : (p,)
+        Nominal values, and the sizes that errors are relative to.
 
     Raises
     ------
@@ -124,42 +128,27 @@ class Unknowns:
                 f"no unknown parameter is given, but at least one is expected: give some of "
                 f"{', '.join([*OF_BODIES, *OF_JOINTS])}."
             )
-        self.parameters = tuple(found.values())
+        self.parameters, self.names = tuple(found.values()), tuple(found)
+        self.values, self.scales = np.array([(one.value, one.scale) for one in found.values()]).T
         self._directions = self._inertial_directions()
 
     def __len__(self) -> int:
         return len(self.parameters)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(one.name for one in self.parameters)
-
-    @property
-    def scales(self) -> Array:
-        return np.array([one.scale for one in self.parameters])
-
-    @property
-    def values(self) -> Array:
-        return np.array([one.value for one in self.parameters])
 
     def at(self, values: Array) -> tuple[Unknowns, Array]:
         """Return these parameters at other values, (p,), of the same scales, and the gears, (n,).
 
         :meth:`regressor` is then of the torque that a gear makes, ``gears`` times the command.
         """
-        import mujoco
-
         body, model = self.body, copy.copy(self.body.model)
         gears = np.ones(body.n)
-        # Short cuts of the engine for centres at 0 and constant inertias.
-        model.body_sameframe[:] = model.body_simple[:] = model.dof_simplenum[:] = 0
         for one, value in zip(self.parameters, values, strict=True):
             if one.kind == "gear":
                 gears[body.joints.index(one.place)] = value
             else:
                 numbers, at = _numbers(body, model, one.kind, one.place)
                 numbers[at] = value
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        settle(model)
         result = copy.copy(self)
         result.body = Body(model, body.source)
         result._directions = result._inertial_directions()
@@ -233,22 +222,17 @@ class Unknowns:
             rows = body.regressor(motion) if rigid is None else rigid
             result[:, :, of_bodies] = rows @ self._directions
         signs = np.tanh(motion.velocities / (SLOW * self.limits.velocity))
+        parts = {"armature": motion.accelerations, "damping": motion.velocities}
+        parts["frictionloss"] = signs
         if needs_torques:
             friction = model.dof_damping[body.dofs] * motion.velocities
             friction += model.dof_frictionloss[body.dofs] * signs
-            torques = body.torques(motion, rows) + friction
+            parts["gear"] = -(body.torques(motion, rows) + friction)
         for i, one in enumerate(self.parameters):
-            if one.kind not in OF_JOINTS:
-                continue
-            k = body.joints.index(one.place)
-            if one.kind == "gear":
-                result[:, k, i] = -torques[:, k]
-            elif one.kind == "frictionloss":
-                result[:, k, i] = signs[:, k]
-            else:
-                moved = motion.accelerations if one.kind == "armature" else motion.velocities
-                result[:, k, i] = moved[:, k]
-        return result * self.scales
+            if one.kind in OF_JOINTS:
+                k = body.joints.index(one.place)
+                result[:, k, i] = parts[one.kind][:, k]
+        return np.asarray(result * self.scales)
 
     def _inertial_directions(self) -> Array:
         """Return derivatives of the inertial parameters by unknowns of bodies, (10 · bodies, k).
@@ -283,9 +267,8 @@ class Unknowns:
 
     def weighted(self, motion: Motion, rate: float, rigid: Array | None = None) -> Array:
         """Return the regressor in units of the noise, (T, n, p), as of ``rate`` rows a second."""
-        noise = self.noise * self.limits.torque
-        result: Array = self.regressor(motion, rigid) * (np.sqrt(rate * motion.dt) / noise)[:, None]
-        return result
+        scales = np.sqrt(rate * motion.dt) / (self.noise * self.limits.torque)
+        return np.asarray(self.regressor(motion, rigid) * scales[:, None])
 
 
 def _numbers(body: Body, model: Any, kind: str, place: str) -> tuple[Array, tuple[int, ...]]:
@@ -359,34 +342,28 @@ def relative_errors(information: Array) -> Array:
 def _sparse(rows: Array) -> Array:
     """Return a basis of the space of some rows, (k, p), that has few parts other than 0.
 
-    Of the space, the vector with the least sum of magnitudes is taken for each parameter that is to
-    be 1 in it; of these the sparsest that are independent.
+    Each vector of it is alone to have a part at its pivot; then multiples of others are taken from
+    it for as long as that leaves fewer parts.
     """
-    k, p = rows.shape
+    k, fewer = len(rows), True
     if not k:
         return rows
-    found = []
-    for i in np.flatnonzero(np.abs(rows).max(axis=0) > SMALL):
-        # rowsᵀ c = a - b with a, b >= 0, least sum of a + b.
-        one = scipy.optimize.linprog(
-            np.concatenate([np.zeros(k), np.ones(2 * p)]),
-            A_eq=np.vstack(
-                [np.hstack([rows.T, -np.eye(p), np.eye(p)]), [*rows[:, i], *np.zeros(2 * p)]]
-            ),
-            b_eq=[*np.zeros(p), 1.0],
-            bounds=[(None, None)] * k + [(0.0, None)] * (2 * p),
-        )
-        if one.success and one.x is not None:
-            vector = one.x[:k] @ rows
-            found.append(np.where(np.abs(vector) > SMALL * np.abs(vector).max(), vector, 0.0))
-    found.sort(key=np.count_nonzero)
-    basis: list[Array] = []
-    for vector in found:
-        together = np.array([*basis, vector])
-        together /= np.linalg.norm(together, axis=1, keepdims=True)
-        if np.linalg.svd(together, compute_uv=False)[-1] > SMALL:
-            basis.append(vector)
-    return np.array(basis).reshape(-1, p)
+    pivots = scipy.linalg.qr(rows, mode="r", pivoting=True)[1][:k]
+    basis = _rounded(np.array(np.linalg.solve(rows[:, pivots], rows), dtype=float))
+    while fewer:
+        fewer = False
+        for i, j in itertools.permutations(range(k), 2):
+            for at in np.flatnonzero(basis[i] * basis[j]):
+                one = _rounded(basis[i] - basis[i, at] / basis[j, at] * basis[j])
+                if np.count_nonzero(one) < np.count_nonzero(basis[i]):
+                    basis[i], fewer = one, True
+    return basis[np.argsort(np.count_nonzero(basis, axis=1), kind="stable")]
+
+
+def _rounded(rows: Array) -> Array:
+    """Return combinations without parts that are small beside their largest one."""
+    sizes = np.abs(rows)
+    return np.where(sizes > SMALL * sizes.max(axis=-1, keepdims=True), rows, 0.0)
 
 
 def _words(row: Array, unknowns: Unknowns) -> str:

@@ -125,7 +125,7 @@ class Report(dict[str, Any]):
         known = [row for row in rows if row["relative"] < 1.96 * TOLD]
         lines = [
             f"expected half-widths of 95 % intervals by {by} {self['seconds']:g} s, with a prior "
-            f"of 100 % on each parameter:"
+            f"of 100 % on each parameter, of a typical size where it is 0:"
         ]
         for row in known[:SHOWN]:
             percent = f"{100.0 * row['relative']:.3g} %"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dopt.arguments import within
+from dopt.arguments import check_finite, within
 from dopt.errors import SpecificationError
 from dopt.robots.body import Body, specification
 from dopt.types import Array
@@ -99,11 +99,7 @@ def _column(log: Any, names: list[str]) -> Array:
             f"each driven joint are expected: rename its columns."
         )
     values = np.column_stack([np.asarray(log[one], dtype=float) for one in names])
-    if not np.isfinite(values).all():
-        raise SpecificationError(
-            f"the columns {', '.join(names[:3])} of a log hold a number that is not finite, but "
-            f"none is expected: leave such rows out at its ends, or fill them."
-        )
+    check_finite(f"columns {', '.join(names[:3])} of the log", values)
     return values
 
 
@@ -165,5 +161,4 @@ def _state(body: Body, model: Any, times: Array, positions: Array, row: int) -> 
     qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
     qpos[body.addresses] = fit[-1]
     qvel[body.dofs] = fit[-2] - bent * model.opt.timestep
-    result: Array = sysid.create_initial_state(model, qpos, qvel)
-    return result
+    return np.asarray(sysid.create_initial_state(model, qpos, qvel))

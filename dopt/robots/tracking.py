@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body, Contacts, KnownBody
+from dopt.robots.body import Body, Contacts, KnownBody, poses
 from dopt.robots.friction import ENCODER
 from dopt.robots.limits import Limits
 from dopt.types import Array
@@ -108,8 +108,7 @@ class Tracker:
 
         A reference that is moved back by what a better feedforward makes up for does not hurry.
         """
-        result: Array = torque / self._gains()[0]
-        return result
+        return torque / self._gains()[0]
 
 
 class Guard:
@@ -168,11 +167,9 @@ def possible_acceleration(known: KnownBody, limits: Limits) -> tuple[Array, Arra
 
     Gravity and the joint's own inertia are looked at in 200 random positions; the largest counts.
     """
-    random, n = np.random.default_rng(0), len(limits.torque)
-    least, largest = np.array(limits.acceleration, dtype=float), np.zeros(n)
-    low, high = limits.position.T
-    for q in low + (high - low) * random.random((200, n)):
-        held = np.abs(known.inverse(q, np.zeros(n), np.zeros(n)))
+    least, largest = np.array(limits.acceleration, dtype=float), np.zeros(len(limits.torque))
+    for q in poses(limits.position, 200):
+        held = np.abs(known.inverse(q, 0.0 * q, 0.0 * q))
         own = np.diag(known.mass_matrix())
         least = np.minimum(least, (TAKEN * limits.torque - held) / own)
         largest = np.maximum(largest, own)

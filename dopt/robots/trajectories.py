@@ -84,8 +84,7 @@ class Family(ABC):
         """
 
     def _times(self, dt: float) -> Array:
-        result: Array = dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
-        return result
+        return dt * np.arange(max(round(self.seconds / dt), 2), dtype=float)
 
     def _centres(self, numbers: Array) -> Array:
         """Return the positions about which joints move, (n,): the middle third of the ranges."""
@@ -115,8 +114,7 @@ class Fourier(Family):
     @property
     def rates(self) -> Array:
         """Angular frequencies, (k,) [rad/s]."""
-        result: Array = 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
-        return result
+        return 2.0 * np.pi / self.period * np.arange(1.0, HARMONICS + 1.0)
 
     @property
     def size(self) -> int:
@@ -157,8 +155,7 @@ class Multisine(Fourier):
     @property
     def rates(self) -> Array:
         lines = max(3, int(min(self.fastest * self.seconds, 20)))
-        result: Array = 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
-        return result
+        return 2.0 * np.pi * np.linspace(1.0 / self.seconds, self.fastest, lines)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,9 +166,7 @@ class Ladder(Family):
     the side that has more room, and ends where the room does.
     """
 
-    @property
-    def name(self) -> str:
-        return "ladder"
+    name = "ladder"
 
     @property
     def segments(self) -> int:
@@ -230,30 +225,21 @@ class Spline(Family):
         q, v, a = (of @ points for of in self.basis(dt))
         return Motion(dt, middle + reach * (q - middle), reach * v, reach * a)
 
-    def basis(self, dt: float) -> tuple[csr_array, csr_array, csr_array]:
+    def basis(self, dt: float) -> tuple[csr_array, ...]:
         """Return positions, velocities and accelerations by the control points, (T, m) each."""
-        t = self._times(dt)
-        knots = self._step * np.arange(-3.0, self._count + 7.0)
-        first, second = self._rates()
-        return (
-            BSpline.design_matrix(t, knots, 3) @ self._repeated(),
-            BSpline.design_matrix(t, knots[1:-1], 2) @ first,
-            BSpline.design_matrix(t, knots[2:-2], 1) @ second,
-        )
+        step = self.seconds / (self._count + 3)
+        t, knots = self._times(dt), step * np.arange(-3.0, self._count + 7.0)
+        inner = knots, knots[1:-1], knots[2:-2]
+        degrees = zip(inner, (3, 2, 1), self._controls(), strict=True)
+        return tuple(BSpline.design_matrix(t, one, k) @ of for one, k, of in degrees)
 
-    @property
-    def _step(self) -> float:
-        return self.seconds / (self._count + 3)
-
-    def _repeated(self) -> csr_array:
+    def _controls(self) -> tuple[csr_array, csr_array, csr_array]:
+        """Return all control points, and rates between them, (m + 6, m), (m + 5, m), (m + 4, m)."""
         rows, last = np.arange(self._count + 6), self._count - 1
-        return csr_array((np.ones(len(rows)), (rows, np.clip(rows - 3, 0, last))))
-
-    def _rates(self) -> tuple[csr_array, csr_array]:
-        """Return velocities and accelerations between control points, (m + 5, m), (m + 4, m)."""
-        points = self._repeated()
-        first = (points[1:] - points[:-1]) / self._step
-        return first, (first[1:] - first[:-1]) / self._step
+        step = self.seconds / (self._count + 3)
+        points: csr_array = csr_array((np.ones(len(rows)), (rows, np.clip(rows - 3, 0, last))))
+        first = (points[1:] - points[:-1]) / step
+        return points, first, (first[1:] - first[:-1]) / step
 
     def shortened(self, numbers: Array, reach: float) -> Array:
         """Return the numbers of a motion that reaches as far as some do with a share of it."""
@@ -266,7 +252,7 @@ class Spline(Family):
         basis, *_ = self.basis(motion.dt)
         points = spsolve((basis.T @ basis).tocsc(), basis.T @ motion.positions)
         points = points.reshape(-1, self.n)
-        limits, (first, second) = self.limits, self._rates()
+        limits, (_, first, second) = self.limits, self._controls()
         away = points - limits.middle
         room = np.ptp(limits.position, axis=1) / 2.0
         taken = _taken(limits, room, away, first @ points, second @ points)
@@ -287,7 +273,7 @@ class Spline(Family):
         """
         points, limits = numbers.reshape(self._count, self.n), self.limits
         found = points.copy()
-        first, second = self._rates()
+        _, first, second = self._controls()
         rates, counts = vstack([first, second]), [first.shape[0], second.shape[0]]
         for k, (low, high) in enumerate(limits.position):
             half, most = ROOM * (high - low) / 2.0, radius * (high - low)
@@ -381,8 +367,7 @@ def _taken(
 ) -> Array:
     """Return the largest shares of a room for positions and of the limits of rates, (n,)."""
     parts = positions / room, velocities / limits.velocity, accelerations / limits.acceleration
-    result: Array = np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
-    return result
+    return np.asarray(np.max([np.abs(part).max(axis=0) for part in parts], axis=0))
 
 
 def _ramps(t: Array, seconds: float) -> tuple[Array, Array, Array]:

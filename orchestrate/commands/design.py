@@ -34,7 +34,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--nuisance",
-        default=None,
+        default="damping,frictionloss",
         metavar="NAMES",
         help="what is also unknown, but not asked for (damping,frictionloss; none: nothing)",
     )
@@ -72,8 +72,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> ExitCode:
     from dopt.robots.body import Body  # SciPy and MuJoCo: other commands do without
-    from dopt.robots.design import FRICTION, Problem
+    from dopt.robots.design import Problem
     from dopt.robots.limits import Limits
+    from dopt.robots.report import Report
 
     if arguments.check and (arguments.out or arguments.ros):
         raise UsageError("--check designs no motion that could be written: leave out --out, --ros.")
@@ -87,24 +88,18 @@ def _run(arguments: argparse.Namespace) -> ExitCode:
         )
     body = Body.load(arguments.robot)
     limits = Limits.of(body, arguments.limits)
-    nuisance = FRICTION if arguments.nuisance is None else arguments.nuisance
     problem = Problem(
         body,
         limits,
         arguments.unknown,
         arguments.seconds,
-        nuisance="" if nuisance == "none" else nuisance,
+        nuisance="" if arguments.nuisance == "none" else arguments.nuisance,
         noise=arguments.noise,
         rate=arguments.rate,
     )
-    return (_check if arguments.check else _design)(arguments, problem)
-
-
-def _check(arguments: argparse.Namespace, problem: Problem) -> ExitCode:
-    """Say what the best of some random multisines can and cannot identify."""
-    from dopt.robots.report import Report
-
-    return _answer(arguments, Report.check(problem, arguments.seed))
+    if arguments.check:
+        return _answer(arguments, Report.check(problem, arguments.seed))
+    return _design(arguments, problem)
 
 
 def _answer(arguments: argparse.Namespace, report: Report, written: Sequence[str] = ()) -> ExitCode:

@@ -75,13 +75,9 @@ class Trace:
 
     def measure(self, robot: SimulatedRobot, torque: Array) -> None:
         """Note the shares of the limits."""
-        limits = robot.limits
-        half = np.diff(limits.position, axis=1)[:, 0] / 2.0
-        taken = {
-            "position": (robot.q - limits.middle) / half,
-            "velocity": robot.v / limits.velocity,
-            "torque": torque / limits.torque,
-        }
+        state = Motion(CONTROL, robot.q, robot.v, 0.0 * robot.v)
+        taken = robot.limits.parts(state, torque)
+        del taken["acceleration"]
         for kind, share in taken.items():
             self.shares[kind] = max(self.shares.get(kind, 0.0), float(np.abs(share).max()))
 
@@ -256,12 +252,23 @@ def payload(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row
             "said": explorer.counts["changed"],
             "mass [kg]": mass,
             "estimated mass [kg]": after - before,
+            **weighed(robot, explorer, mass),
             "held: curve": (np.abs(values - true_values(robot)) <= half)[:, :-2].mean(),
             "error at the end": float(np.max(trace.errors[-1])),
             **{f"share of limit: {kind}": share for kind, share in trace.shares.items()},
         }
         for quantity, value in found.items():
             yield Row("payload", name, f"{mass:.2f} kg", seed, quantity, float(value))
+
+
+def weighed(robot: SimulatedRobot, explorer: RobotExplorer, mass: float) -> dict[str, float]:
+    """Return errors of the payload's mass and first moment by their standard errors."""
+    if explorer.payload is None:
+        return {}
+    (found, covariance), true = explorer.payload, robot.ball(mass)[:4]
+    by = (found - true) / np.sqrt(np.diag(covariance))
+    names = ("mass", "moment x", "moment y", "moment z")
+    return {f"error by standard error: {one}": x for one, x in zip(names, by, strict=True)}
 
 
 def steps(name: str, body: Body, limits: Limits, seeds: range) -> Iterator[Row]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dopt.robots.body import Body
+from dopt.robots.body import Body, hang, point
 from dopt.robots.limits import Limits
 from dopt.types import Array
 
@@ -181,14 +181,14 @@ class SimulatedRobot:
 
     def _take(self, mass: float) -> None:
         """Hang a ball of 4 cm on the last moved body, 8 cm before its centre of mass."""
-        model, last = self._model, self.body.moved[-1]
-        own, centre = float(model.body_mass[last]), model.body_ipos[last].copy()
+        hang(self._model, self.body.moved[-1], self.ball(mass))
+
+    def ball(self, mass: float) -> Array:
+        """Return the inertial parameters of the ball, (10,)."""
+        centre = self.body.model.body_ipos[self.body.moved[-1]]
         reach = 0.08 * np.array([0.5, 0.0, math.sqrt(0.75)])
-        share = mass / (own + mass)
-        model.body_mass[last] = own + mass
-        model.body_ipos[last] = centre + share * reach
-        model.body_inertia[last] += mass * (1 - share) * 0.08**2 + 0.4 * mass * 0.04**2
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        own = 0.4 * mass * 0.04**2 * np.repeat([0.0, 1.0, 0.0], [4, 3, 3])
+        return point(mass, mass * (centre + reach)) + own
 
 
 LIMITS = Path(__file__).with_name("iiwa.yaml")

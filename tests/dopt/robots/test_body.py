@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.robots.body import Body, Contacts, Motion
+from dopt.robots.body import Body, Contacts, KnownBody, Motion, hang, point
 from dopt.robots.limits import Limits, check_weight
 from dopt.robots.parameters import Identifiability, Unknowns, count_null, relative_errors
 from tests.paths import ROOT, printed
@@ -194,6 +194,27 @@ def test_regressors_at_other_values_are_derivatives_there(arm: Body, limits: Lim
         np.testing.assert_allclose(rows[:, :, i], expected, atol=1e-5 * max(1.0, np.ptp(expected)))
 
 
+@pytest.mark.parametrize("link", ["pos='.1 0 .2' euler='.3 .2 .1'", ""])
+def test_what_hangs_on_a_body_moves_as_if_it_were_in_the_file(link: str) -> None:
+    """Once it added its inertia about all axes, and its weight to a centre at 0 that stayed."""
+    last = f"""<mujoco><worldbody><body pos="0 0 1" euler="1 .4 0"><joint axis="0 0 1"/>
+        <geom size=".05" mass="1"/><body pos=".3 0 0"><joint axis="0 1 .5"/>
+        <geom type="box" size=".03 .05 .2" {link} mass=".8"/>{{}}</body></body></worldbody></mujoco>
+        """
+    mass, centre, own = 0.6, np.array([0.1, -0.2, 0.15]), 0.4 * 0.6 * 0.04**2
+    ball = f'<geom size=".04" pos="{" ".join(map(str, centre))}" mass="{mass}"/>'
+    body, whole, motion = body_of(last.format("")), body_of(last.format(ball)), random_motion(2)
+    known = KnownBody(body)
+    for way in (1.0, -1.0):
+        added = point(mass, mass * centre)
+        added[4:7] += own
+        hang(known.model, body.moved[-1], way * added)
+        same = whole if way > 0.0 else body
+        states = zip(motion.positions, motion.velocities, motion.accelerations, strict=True)
+        found = np.array([known.inverse(*state) for state in states])
+        np.testing.assert_allclose(found, same.torques(motion), atol=1e-9)
+
+
 def test_dry_friction_and_gear(arm: Body, limits: Limits) -> None:
     motion = random_motion(arm.n)
     unknowns = Unknowns(arm, limits, "frictionloss:roll,gear:lift")
@@ -293,7 +314,10 @@ def test_limits_that_look_like_defaults_are_said(tmp_path: Path) -> None:
     [
         ("joints: {wrist: {velocity: 2}}", "joint 'wrist' is unknown"),
         ("joints: {lift: {speed: 2}}", "limit of joint 'lift' 'speed' is unknown"),
-        ("joints: {lift: {velocity: fast}}", "lift.velocity in .* is 'fast', but a positive"),
+        ("joints: {lift: {velocity: fast}}", "lift.velocity in .* is 'fast', but a number above 0"),
+        ("joints: {lift: {torque: true}}", "lift.torque in .* is True, but a number above 0"),
+        ("joints: {lift: {position: [1, 2, 3]}}", r"has the shape \(3,\) .* but 2 real numbers"),
+        ("joints: {lift: {position: .nan}}", r"is \[nan, nan\], but finite numbers"),
         ("joints: {lift: {position: [2, 1]}}", r"is \[2, 1\], but \[low, high\]"),
         ("joints: {lift: 3}", "lift in .* is 3, but a mapping"),
         ("[1, 2]", "has no mapping 'joints'"),
@@ -562,8 +586,12 @@ def test_constraints_that_driven_joints_would_break_are_refused(
     if not tied:
         assert Body(model).joints[0] == "a"
         return
-    with pytest.raises(SpecificationError, match=r"equality0 ties .*: take it from the file"):
+    with pytest.raises(
+        SpecificationError, match=r"equality0 \((connect|weld|joint) of .* ties"
+    ) as error:
         Body(model)
+    assert "take it from the file" in str(error.value)
+    assert ("of a" if "joint1" in tie else "two") in str(error.value)
 
 
 def test_a_joint_that_mimics_another_is_not_driven(tmp_path: Path) -> None:

@@ -277,7 +277,7 @@ def test_the_fit_in_the_helper_s_documentation_recovers_friction_armature_and_ma
         np.testing.assert_array_equal(pieces.sensordata[k].data, q[100 * k : 100 * (k + 1)])
     for broken, said in (
         (log.drop(columns="q_a"), "no column 'q_a'"),
-        (log.assign(tau_b=np.nan), "not finite"),
+        (log.assign(tau_b=np.nan), "row 0 of the columns tau_a, tau_b of the log is .* finite"),
         (log.assign(time=log.time**2), "not evenly spaced"),
     ):
         with pytest.raises(SpecificationError, match=said):
