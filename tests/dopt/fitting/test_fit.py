@@ -76,7 +76,8 @@ def truth(
     x, out = np.array([*x0, held(t[0] + 1e-12)]), {switches[0]: np.array(x0)}
     for a, b in itertools.pairwise(switches):
         now = held(0.5 * (a + b))
-        x = solve_ivp(rate, (a, b), x, args=(now,), rtol=1e-10, atol=1e-12).y[:, -1]
+        how: dict[str, Any] = {"args": (now,), "method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
+        x = solve_ivp(rate, (a, b), x, **how).y[:, -1]
         out[b] = x[:2]
     return np.array([out[s] for s in t])
 
