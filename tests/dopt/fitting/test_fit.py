@@ -455,7 +455,7 @@ def test_a_delay_keeps_its_prior_as_other_constants_do() -> None:
 )
 def test_what_a_smooth_input_does_between_rows_is_said(hold: str, better: str) -> None:
     """A mass on a spring over a road, of which constants were far off without a word."""
-    rng, t = np.random.default_rng(0), np.arange(4000.0) * 0.01
+    rng, t = np.random.default_rng(0), np.arange(2400.0) * 0.01
     frequencies, phases = rng.uniform(0.5, 6, 12), rng.uniform(0, 6, 12)
 
     def road(s: float) -> Any:
@@ -476,7 +476,7 @@ def test_what_a_smooth_input_does_between_rows_is_said(hold: str, better: str) -
         box={"speed": 10.0},
         measured={"height": 1e-3},
     )
-    table = {"t": t, "height": x + 1e-3 * rng.normal(size=4000), "road": [*map(road, t)]}
+    table = {"t": t, "height": x + 1e-3 * rng.normal(size=2400), "road": [*map(road, t)]}
     found = dopt.fit(plant, table, width=0, hold=hold, window=0.5)
     errors = {"spring": 200.0, "damping": 3.0}
     off = max(
