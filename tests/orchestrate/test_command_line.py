@@ -62,24 +62,20 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
             "'regularization' is unknown, no setting of policy exists",
         ),
         (["seed=1,2"], "'seed=1,2' gives several values to one trial: add -m"),
-        (["seed=range(3)"], "'seed=range\\(3\\)' gives several values to one trial"),
         (["launch.ray=3"], "launch.ray is 3, but a section"),
-        (["width=${wdth}"], "'wdth' not found"),
         (["env=[1"], "cannot read the override 'env=\\[1' .*: put a value with special characters"),
         (["env=quadrotor", "policy=periodic"], "eigenmode"),
         (["-m", "env=quadrotor", "policy=periodic"], "the grid is empty: env=quadrotor"),
         (["executor.name=locla"], "executor.name 'locla' is unknown.* did you mean 'local'"),
         *(
-            ([*words, f"executor.device={device}"], f"executor.device is '{device}'")
-            for words in (["executor=lockstep"], ["-m", "seed=0", "executor=lockstep"])
-            for device in ("cuda:99", "banana", "meta")
+            ([*words, "executor=lockstep", f"executor.device={device}"], f"device is '{device}'")
+            for words, device in (([], "cuda:99"), (["-m", "seed=0"], "banana"), ([], "meta"))
         ),
         (["plant=real", "plant.delay=-1"], "plant.delay is -1.0 samples"),
         (["plant.delay=1"], "setting of plant 'delay' is unknown without .*: add plant=real"),
         (["+limits.bounds={y:[-1,1]}"], "'bounds' is unknown without .*: add limits=box or lim"),
         (["-m", "seed=0", "++task.steps=3"], "'steps' is unknown without .*: add task=control"),
         (["+env=arm"], "'\\+env=arm' adds an option, but env has one already: leave out the \\+"),
-        (["-m", "++policy=random"], "adds an option, but policy has one already"),
         (["plant=real", "plant.delay=1", "model=affine"], "goes with a model of the state alone"),
         (["executor=rey"], "executor 'rey' is unknown.* did you mean 'ray'"),
         (["launch.retry=fail"], "launch.retry 'fail' is unknown.* did you mean 'failed'"),
@@ -105,7 +101,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["env.dt=${oc.env:NO}"], "what env.dt refers to .*'NO' not found.*variable that is set"),
         (["env.dt=${env.dt}"], "what env.dt refers to .* cannot be found \\(Recursive"),
         (["=3"], "'=3' names no key: write key=value"),
-        (["seed==3"], "cannot read the override 'seed==3': put a value"),
         (["-m", "--cfg", "job"], "-m and --cfg cannot be combined"),
         (["--resolve"], "--resolve goes with --cfg or --help"),
         (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor, beyond/car"),
@@ -114,8 +109,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["policy=5"], "the option of a group is a number, but one of its names is expected"),
         (["--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "add it with \\+env\\.mass="),
         (["--config-dir", str(OPTIONS), "env=boat", "env.gama=3"], "did you mean 'gamma'"),
-        (["-m", "--config-dir", str(OPTIONS), "env=boat", "env.gama=3"], "did you mean 'gamma'"),
-        (["-m", "--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "\\+env\\.mass="),
         (["env=[arm,cartpole]"], "env is the list \\[arm,cartpole\\], .*-m env=a,b"),
         (["-m", "env=null,arm"], "env 'null' is unknown"),
         (["-m", "policy=null,random"], "'null' is unknown: choose one of baseline/chirp, "),
@@ -124,7 +117,6 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["pendulum"], "'pendulum' is not an override: write key=value"),
         (["seed=abc"], "seed is 'abc', but a whole number"),
         (["env.horizon=null"], "env.horizon is null, but a whole number is expected"),
-        (["+evn=arm"], "setting 'evn' is unknown.* did you mean 'env'"),
         (["+launch.ray.adress=x"], "setting of launch.ray 'adress' is unknown"),
         (["executor=local", "+executor.device=cuda"], "setting of executor 'device' is unknown"),
         (["experiment=width", "width=8", "env=arm"], "is a grid .*policy=d_optimal.*: add -m"),
