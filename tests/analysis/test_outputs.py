@@ -281,12 +281,3 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(
     (tmp_path / "file").write_text("")
     assert main(["figures", "--db", url, "--out", str(tmp_path / "file" / "figures")]) == 2
     assert "choose another --out" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["figures", "compare", "calibration", "sample-loss", "report"])
-def test_a_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match=r"^0$"):
-        main([name, "--help"])
-    said = capsys.readouterr().out
-    assert "usage" in said.lower()
-    assert "%%" not in said

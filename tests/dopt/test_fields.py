@@ -228,13 +228,6 @@ def test_a_section_has_every_field_and_what_identifies_it_only_what_was_changed(
     assert Derived(frequency=2.0, label="slow").kernel_numbers(1, 1.0) == (0.5, 2.0, 0.25)
 
 
-def test_what_identifies_a_section_builds_the_same_item() -> None:
-    for cls in POLICIES.values():
-        item = cls()
-        assert build("policy", POLICIES, identifying_section(item)) == item
-        assert build("policy", POLICIES, section_of(item)) == item
-
-
 PLAIN = trial("pendulum", "d_optimal")
 FRESH = trial("pendulum", "d_optimal", policy={"information": "fresh"})
 

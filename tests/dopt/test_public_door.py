@@ -7,7 +7,6 @@ import importlib.metadata
 import logging
 import os
 import pwd
-import pydoc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,13 +48,6 @@ def test_the_version_is_that_of_the_code_and_not_of_another_project(
     versions.cache_clear()
     assert versions()["dopt"] == dopt.__version__
     assert launch_record([], [], ROOT).versions["dopt"] == dopt.__version__
-
-
-def test_help_shows_what_the_names_are() -> None:
-    text = pydoc.render_doc(dopt, renderer=pydoc.plaintext)
-    for name in ("run_trial", "TrialSpec", "SYSTEMS", "LEARNERS"):
-        assert name in text
-    assert all(getattr(dopt, name).__doc__ for name in ("run_trial", "TrialSpec", "TrialResult"))
 
 
 def test_a_type_checker_sees_the_names_where_they_are() -> None:

@@ -150,9 +150,9 @@ def login(server: Engine, server_grid: str, monkeypatch: pytest.MonkeyPatch) -> 
         connection.execute(text(f"DROP ROLE {name}"))
 
 
-def launch(url: str) -> None:
+def launch(url: str, seed: int = 0) -> None:
     """Register a trial and give it an outcome, as a launch does."""
-    (spec,) = make_grid(("pendulum",), ("random",), range(1), **grids.SHORT)
+    (spec,) = make_grid(("pendulum",), ("random",), [seed], **grids.SHORT)
     with Store.open(url) as store:
         number = grids.begin(store)
         store.register(number, [spec])
@@ -169,36 +169,37 @@ def test_statements_run_as_the_user_who_can_only_read(
     assert "secret" not in page
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "SELECT pg_advisory_lock(hashtext('dopt.store.' || current_schema()))",
-        "SELECT pg_advisory_lock_shared(hashtext('dopt.store.' || current_schema()))",
-        "SELECT pg_terminate_backend({pid})",
-        "SELECT pg_cancel_backend({pid})",
-        "SELECT pg_sleep(3600)",
-        "SELECT set_config('role', '{owner}', false)",
-        "SELECT set_config('role', '{owner}', true), pg_terminate_backend({pid})",
-        "SELECT set_config('default_transaction_read_only', 'off', false)",
-        "SELECT * FROM trial FOR UPDATE",
-        "LOCK TABLE trial",
-    ],
+HARMS = (
+    "SELECT pg_advisory_lock(hashtext('dopt.store.' || current_schema()))",
+    "SELECT pg_advisory_lock_shared(hashtext('dopt.store.' || current_schema()))",
+    "SELECT pg_terminate_backend({pid})",
+    "SELECT pg_cancel_backend({pid})",
+    "SELECT pg_sleep(3600)",
+    "SELECT set_config('role', '{owner}', false)",
+    "SELECT set_config('role', '{owner}', true), pg_terminate_backend({pid})",
+    "SELECT set_config('default_transaction_read_only', 'off', false)",
+    "SELECT * FROM trial FOR UPDATE",
+    "LOCK TABLE trial",
 )
+
+
 @pytest.mark.usefixtures("login")
 def test_no_statement_harms_a_launch(
-    visit: Visit, server: Engine, server_grid: str, monkeypatch: pytest.MonkeyPatch, statement: str
+    visit: Visit, server: Engine, server_grid: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    client, works = visit(server_grid), re.search("advisory|read_only", statement)
-    with server.connect() as other, monkeypatch.context() as patch:
-        patch.setattr(sql, "TIMEOUT_SECONDS", sql.TIMEOUT_SECONDS if works else 1.0)
-        pid, owner = other.execute(text("SELECT pg_backend_pid(), current_user")).one()
-        answer = post(client, "/api/sql", statement.format(pid=pid, owner=owner))
-        assert answer.status_code == (200 if works else 400)
-        assert other.execute(text("SELECT 1")).scalar_one() == 1
-    launch(server_grid)
-    found = post(client, "/api/sql", "SELECT current_user, count(*) FROM v_trial").json()
-    assert found["rows"][0][0] != owner
-    assert found["rows"][0][1] == 1
+    client, usual = visit(server_grid), sql.TIMEOUT_SECONDS
+    for seed, statement in enumerate(HARMS):
+        works = re.search("advisory|read_only", statement)
+        with server.connect() as other, monkeypatch.context() as patch:
+            patch.setattr(sql, "TIMEOUT_SECONDS", usual if works else 1.0)
+            pid, owner = other.execute(text("SELECT pg_backend_pid(), current_user")).one()
+            answer = post(client, "/api/sql", statement.format(pid=pid, owner=owner))
+            assert answer.status_code == (200 if works else 400), statement
+            assert other.execute(text("SELECT 1")).scalar_one() == 1, statement
+        launch(server_grid, seed)
+        found = post(client, "/api/sql", "SELECT current_user, count(*) FROM v_trial").json()
+        assert found["rows"][0][0] != owner, statement
+        assert found["rows"][0][1] == seed + 1, statement
 
 
 @pytest.mark.usefixtures("login")

@@ -54,7 +54,7 @@ def test_a_replay_makes_the_same_posterior(
     monkeypatch.setattr(gaussian_process, "MOST_SAMPLES", room)
     path = tmp_path / "run.jsonl"
     with explorer(plant, journal=path) as one:
-        drive(one, 150, plant)
+        drive(one, 90, plant)
         before, refits = one.parameters.copy(), one.counts["refits"]
         state = one._state
         factors = state._trial.state.posterior

@@ -107,10 +107,7 @@ CASES: dict[str, tuple[Any, ...]] = {
     "joint_ekf": (MEASURED, RIDGE, "mlp", "joint_ekf"),
     "joint_ekf, random": (MEASURED, "random", "mlp", REFITTED),
     "conditioning": (not MEASURED, PROCESS, PROCESS, "conditioning"),
-    "simulation_error": (
-        *(not MEASURED, "random", SMALL),
-        {"name": "simulation_error", "growth": 1.0},
-    ),
+    "simulation_error": (not MEASURED, "random", SMALL, "simulation_error"),
 }
 """True if the angle alone is measured; policy, model, learner, and limits."""
 
@@ -167,9 +164,9 @@ def learned(case: str, units: Units, steps: int) -> Learned:
 
 @pytest.mark.parametrize("case", CASES)
 def test_powers_of_two_change_no_bit(case: str) -> None:
-    """Other factors change the rounding alone. A fit to simulations is made in 310 steps."""
+    """Other factors change the rounding alone. A fit to simulations is made in 200 steps."""
     fitted = case == "simulation_error"
-    steps = 310 if fitted else 100
+    steps = 200 if fitted else 100
     expected = learned(case, Units(), steps)
     assert (expected.refits > 0) == fitted
     for units in (Units(1024.0, 0.125), Units(0.125, 1024.0))[fitted:]:
@@ -179,7 +176,7 @@ def test_powers_of_two_change_no_bit(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_other_units_change_hardly_anything(case: str) -> None:
-    found, expected = (learned(case, units, 400) for units in (Units(0.1, 1000.0), Units()))
+    found, expected = (learned(case, units, 200) for units in (Units(0.1, 1000.0), Units()))
     costs = (np.cumsum(one.errors[:100] ** 2) for one in (found, expected))
     np.testing.assert_allclose(*costs, rtol=1e-6)
     assert found.free_run_error == pytest.approx(expected.free_run_error, rel=0.05)

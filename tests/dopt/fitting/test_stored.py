@@ -24,6 +24,7 @@ from orchestrate.store.merge import merge
 from tests.analysis.synthetic import fill, make_grid
 from tests.dopt.fitting.test_fit import declared, run
 
+pytestmark = pytest.mark.xdist_group("stored fits")  # the fits are made once for all of them
 ROWS = 420
 
 

@@ -248,7 +248,7 @@ def test_bodies_do_not_touch_what_they_do_not_touch_at_home(inputs: str, seeds: 
         near += explorer.counts["near"]
     assert near >= seeds / 2
     blind = pair(0, inputs=inputs)
-    assert robot.body.collisions(positions_of(*blind, 4.0))
+    assert robot.body.collisions(positions_of(*blind, 1.0))
     assert blind[1].counts["near"] == 0
 
 

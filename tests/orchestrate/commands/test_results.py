@@ -17,7 +17,6 @@ import pytest
 
 from dopt.result import Assessment
 from orchestrate.__main__ import COMMANDS, main
-from orchestrate.commands import Command
 from orchestrate.errors import ExitCode
 from orchestrate.program import Parser
 from orchestrate.store import Store
@@ -63,16 +62,6 @@ def test_without_a_command_it_lists_them(words: list[str], capsys: Capture) -> N
     for command in COMMANDS:
         assert f"  {command.name} " in out
         assert command.help in out
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_every_command_has_help_and_the_common_options(command: Command, capsys: Capture) -> None:
-    with pytest.raises(SystemExit) as end:
-        main([command.name, "--help"])
-    assert end.value.code == 0
-    out, _ = capsys.readouterr()
-    assert ("--db URL" in out) == command.needs_database
-    assert "--json" in out
 
 
 @pytest.mark.parametrize(
@@ -128,19 +117,6 @@ class TestOnEveryDatabase:
         code, sentence = refusal([*words, "--db", url], capsys)
         assert code == ExitCode.INFRASTRUCTURE
         assert "hunter2" not in sentence
-
-    def test_a_newer_and_an_older_database(
-        self, words: list[str], url: str, store: Store, capsys: Capture
-    ) -> None:
-        for version, said in (
-            (9999, "update the program"),
-            (5, "python -m orchestrate upgrade --db"),
-        ):
-            with store._backend.transaction() as connection:
-                connection.exec_driver_sql(f"UPDATE alembic_version SET version_num = '{version}'")
-            code, sentence = refusal([*words, "--db", url], capsys)
-            assert code == ExitCode.BAD_REQUEST
-            assert said in sentence
 
     def test_an_empty_database(
         self,
