@@ -308,6 +308,12 @@ class _Selection:
             later = range(last + 1, last + 1 + len(SCANNED) // 2) if best == last else ()
             shifts = [shift for shift in later if guess + shift * self.step <= latest]
         self.scan = {guess + shift * self.step: fit[0] for shift, fit in fits.items()}
+        if not np.isfinite(fits[best][2].squares).any():
+            raise SpecificationError(
+                f"no window of {seconds:g} s of the logs can be simulated by the equations from "
+                f"states that fit it, but some are expected to stay finite and within the plant's "
+                f"limit: correct units, zeros of the measured states or guesses of the constants."
+            )
         self.say(f"delay: {best:+d} samples from the guess fit best")
         if isinstance(declared, Unknown):
             self.delay += best * self.step

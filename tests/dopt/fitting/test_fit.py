@@ -609,6 +609,22 @@ def test_stamps_in_another_unit_are_refused() -> None:
             dopt.fit(declared(), table.assign(time=scale * table.time), width=0)
 
 
+def test_equations_that_nothing_follows_are_said() -> None:
+    """Two counters with zeros far apart: a stiff shaft between them led every state away."""
+    t, u = np.arange(400) * 0.02, np.random.default_rng(0).uniform(-2, 2, 400)
+    angle = np.cumsum(0.02 * u)
+    plant = pendulum(
+        states={"angle": "rad", "load": "rad", "rate": "rad/s"},
+        known={"angle": "rate", "load": "rate", "rate": "gain * voltage - 1e4 * (angle - load)"},
+        constants={"gain": dopt.unknown(1.0)},
+        angles=["angle", "load"],
+        measured={"angle": 0.01, "load": 0.01},
+    )
+    data = {"time": t, "voltage": u, "angle": angle, "load": angle + 3e6}
+    with pytest.raises(SpecificationError, match=r"no window of .* zeros of the measured states"):
+        dopt.fit(plant, data, width=0)
+
+
 def test_steps_that_are_too_long_are_said(fitted: Fitted) -> None:
     found = dopt.fit(declared(dt=0.12), run(0)[::6], width=0)
     assert "steps of 0.12 s are too long for these equations" in found.report()
