@@ -53,9 +53,6 @@ SURE = 0.9
 EXACT = 0.002
 """Share of its changes that measurements leave, below which a law, with a quantum, tells them."""
 
-MOSTLY = 0.5
-"""Share of its changes, that a law is to tell."""
-
 FAR = 7.5
 """Part of an input that its past leaves open, by its median, above which it jumps there."""
 
@@ -347,7 +344,7 @@ def _law_of_changes(pieces: Sequence[Piece], j: int) -> float:
     usual = _usual(seen[there], changes[there])
     changes, seen = changes[there][usual], seen[there][usual]
     total = float(changes @ changes)
-    return _left(seen, changes)[0] / total if total > 0.0 and usual.mean() > MOSTLY else 1.0
+    return _left(seen, changes)[0] / total if total > 0.0 and usual.mean() > 0.5 else 1.0
 
 
 def _feedback(past: Array, seen: Array, now: Vector) -> tuple[float, float]:

@@ -176,20 +176,18 @@ def _csv_in(file: Path, encoding: str) -> pd.DataFrame:
     usual = top[len(top) * 3 // 4]
     mark = next((one for one in ";\t," if one in usual), r"\s+")
     rows = [re.split(mark, line.lstrip("\ufeff").strip()) for line in top]
-    fewest = len(re.split(mark, usual.strip())) - 1  # a mark may end each line but the first
-    numbers = [sum(bool(re.match(r'"?[-+.]?\d', one.strip())) for one in row) for row in rows]
-    many = zip(rows, numbers, strict=True)
-    data = next((k for k, (row, n) in enumerate(many) if n >= max(fewest, len(row)) / 2), 1)
+    half = (len(re.split(mark, usual.strip())) - 1) / 2  # a mark may end each line but the first
+    numbers = (sum(bool(re.match(r'\s*"?[-+.]?\d', one)) for one in row) for row in rows)
+    data = next((k for k, n in enumerate(numbers) if n >= max(half, len(rows[k]) / 2)), 1)
     if not data:
         raise ValueError("its first line has numbers and no names of columns")
     units = [one.strip(' []()"') for one in rows[data - 1]]
-    has_units = (
-        data > 1 and len(rows[data - 2]) == len(units) and not SECONDS.keys().isdisjoint(units)
-    )
-    first = data - 1 - has_units
-    decimal, skipped = "," if mark == ";" else ".", [k for k in range(data) if k != first]
-    options: Any = {"encoding": encoding, "skipinitialspace": True, "skiprows": skipped}
-    table = pd.read_csv(file, sep=mark, decimal=decimal, **options)
+    alike = data > 1 and len(rows[data - 2]) == len(units)
+    has_units = alike and not SECONDS.keys().isdisjoint(units)
+    skipped = [k for k in range(data) if k != data - 1 - has_units]
+    options: Any = {"encoding": encoding, "skiprows": skipped, "skipinitialspace": True}
+    decimal = "," if mark == ";" else "."
+    table: pd.DataFrame = pd.read_csv(file, sep=mark, decimal=decimal, **options)
     if not isinstance(table.index, pd.RangeIndex):  # the first values of longer rows
         if table.iloc[:, -1].notna().any():
             raise ValueError("its rows have more values than its first line has names")
@@ -562,7 +560,8 @@ def _rest(log: Log, health: Health) -> Iterator[str]:
 
 def _others(log: Log, table: pd.DataFrame) -> Iterator[str]:
     """Yield the columns that are neither states nor inputs."""
-    for name in table.columns.difference([*log.states, *log.inputs], sort=False):
+    used = {*log.states, *log.inputs, *clocks_of(columns_of(table), log.states)}
+    for name in table.columns.difference([*used], sort=False):
         if is_flag(table[name]):
             yield f"{name}: a flag, not 0 in {int((table[name] != 0).sum()):,} rows"
         elif is_text(table[name]):

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from dopt.errors import SpecificationError
+from dopt.fitting import export
 from dopt.fitting.model import Model, data_of, measured_names
 from dopt.fitting.problem import (
     FEWEST,
@@ -445,9 +446,8 @@ class Fitted:
             If the package orchestrate is not installed.
         """
         from dopt.explorer.saving import new_saver
-        from dopt.fitting.export import FittedTrial
 
-        trial, saver = FittedTrial(self), new_saver(url)
+        trial, saver = export.FittedTrial(self), new_saver(url)
         try:
             saver.save(trial, trial.result)
         finally:
@@ -456,25 +456,19 @@ class Fitted:
 
     def save(self, path: str | Path) -> None:
         """Write the model as arrays (.npz), which NumPy alone reads; pickle keeps the whole fit."""
-        from dopt.fitting.export import save
-
         if "://" in str(path):
             raise SpecificationError(
                 "path is the URL of a database, but a file is expected: give the URL to store()."
             )
-        save(self, path)
+        export.save(self, path)
 
     def to_torch(self) -> Any:
         """Return dx/dt as a module of PyTorch, whose parameters are constants and weights."""
-        from dopt.fitting.export import to_torch
-
-        return to_torch(self)
+        return export.to_torch(self)
 
     def environment(self) -> Any:
         """Return the plant as an environment of Gymnasium that begins at states of the logs."""
-        from dopt.fitting.export import environment
-
-        return environment(self)
+        return export.environment(self)
 
     def _with(self, run: Any) -> Data:
         log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)

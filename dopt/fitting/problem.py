@@ -17,8 +17,9 @@ Predictions of parts of a log are at the end, with a linear model for comparison
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numba
@@ -212,17 +213,10 @@ class Simulator:
         return Linear(normal, slope, T, C, g, scores, parts)
 
 
-def _batches(sizes: Integers) -> list[tuple[int, int]]:
+def _batches(sizes: Integers) -> Iterator[tuple[int, int]]:
     """Return ranges of windows of about ``BATCH_ROWS`` rows each."""
-    out, first, total = [], 0, 0
-    for k, size in enumerate(sizes):
-        total += size
-        if total >= BATCH_ROWS:
-            out.append((first, k + 1))
-            first, total = k + 1, 0
-    if first < len(sizes):
-        out.append((first, len(sizes)))
-    return out
+    batch = np.cumsum(sizes) // BATCH_ROWS
+    return itertools.pairwise([0, *(np.flatnonzero(np.diff(batch, append=-1)) + 1).tolist()])
 
 
 class Solution(NamedTuple):

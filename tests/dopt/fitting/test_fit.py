@@ -609,6 +609,14 @@ def test_stamps_in_another_unit_are_refused() -> None:
             dopt.fit(declared(), table.assign(time=scale * table.time), width=0)
 
 
+def test_what_never_changes_in_the_logs_is_said() -> None:
+    data = run(0, 420)
+    with pytest.raises(SpecificationError, match=r"nothing that was measured .angle. changes"):
+        dopt.fit(declared(), data.assign(angle=1.0), width=0)
+    found = dopt.fit(declared(), data.assign(voltage=0.0), width=0, window=0.4)
+    assert "voltage never changes in the logs" in found.report()
+
+
 def test_equations_that_nothing_follows_are_said() -> None:
     """Two counters with zeros far apart: a stiff shaft between them led every state away."""
     t, u = np.arange(400) * 0.02, np.random.default_rng(0).uniform(-2, 2, 400)
