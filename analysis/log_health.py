@@ -92,8 +92,6 @@ class Effect:
         Share of what the input's own past leaves open that the measurements explain.
     predicted : float
         Share of the input that its own past tells.
-    law : float
-        Share of its changes between jumps that the changes of the measurements leave open.
     """
 
     input: str
@@ -104,7 +102,6 @@ class Effect:
     open: float
     feedback: float
     predicted: float
-    law: float
 
     @property
     def follows_state(self) -> bool:
@@ -132,8 +129,7 @@ class Effect:
     @property
     def may_be_closed(self) -> bool:
         """Return whether feedback and an input as regular as the motion are not told apart."""
-        regular = self.feedback > BETWEEN or self.law < EXACT
-        return self.follows_state or (regular and not self.closed_loop)
+        return self.follows_state or (self.feedback > BETWEEN and not self.closed_loop)
 
 
 def effects(log: Log) -> list[Effect]:
@@ -308,21 +304,21 @@ def _steadiness(x: Vector, motion: Vector) -> float:
     return abs(slope) / max(error, 1e-300)
 
 
-def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float, float]:
-    """Return what the state leaves open of an input, what it adds to its past, the past, the law.
+def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
+    """Return what the state leaves open of an input, what it adds to its past, and the past.
 
     Rows in which the input stays as it is, such as at a limit, tell of no feedback, and its jumps,
     such as at steps of a set point, may hide what is fed back between them. The last two are of the
-    rows in which it moves, and of these between jumps where much is. The law is in changes over
-    several rows, as a quantum may hide what a measurement adds to the past.
+    rows in which it moves, and of these between jumps where much is. Where a quantum hides what a
+    measurement adds to the past, changes over several rows still follow a law.
     """
     rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
     if not rows:
-        return 1.0, 0.0, 0.0, 1.0
+        return 1.0, 0.0, 0.0
     now, past, seen = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     numbers = past.shape[1] + seen.shape[1]
     if len(now) < 4 * numbers:
-        return 1.0, 0.0, 0.0, 1.0
+        return 1.0, 0.0, 0.0
     left = _left(np.column_stack([past[:, 0], seen]), now)[0]
     share = left / float(((now - now.mean()) ** 2).sum())
     moves = now != past[:, 1 + j]
@@ -331,10 +327,12 @@ def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float, float]:
     usual = _usual(past, now)
     between = _feedback(past[usual], seen[usual], now[usual])
     found = between if between[0] > BETWEEN else _feedback(past, seen, now)
-    return share, *found, _law_of_changes(pieces, j)
+    if found[0] < FEEDBACK and unexplained_changes(pieces, j) < EXACT:
+        return share, 1.0, 1.0
+    return share, *found
 
 
-def _law_of_changes(pieces: Sequence[Piece], j: int) -> float:
+def unexplained_changes(pieces: Sequence[Piece], j: int) -> float:
     """Return the share of an input's changes, without jumps, that measured changes leave open."""
     seen, changes = (
         np.concatenate([part[_PAST:] - part[:-_PAST] for part in parts])

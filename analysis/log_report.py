@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.data.matching import AnalysisError
-from analysis.log_health import EXACT, FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
+from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signal, examine
 from analysis.style import number
 from dopt.errors import given_path, install_command
 from dopt.log import Log
@@ -525,8 +525,6 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
         yield f"{pair}: suspected delay: {samples}{about}"
     if effect.may_be_closed:
         what = "a function of the state" if effect.follows_state else "its own past tells all of it"
-        if effect.law < EXACT and not effect.follows_state:
-            what = "between jumps it changes as measurements do"
         yield f"{effect.input}: closed loop, or as regular as the motion: {what}"
     elif effect.closed_loop:
         yield (

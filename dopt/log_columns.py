@@ -312,20 +312,18 @@ def _going_on(seconds: Array, periods: Sequence[float], notes: list[str]) -> Arr
     """Return stamps of a 32-bit counter that began again as if it had gone on."""
     there = np.flatnonzero(np.isfinite(seconds))
     steps = np.diff(seconds[there])
-    forward = steps[steps > 0]
-    if not forward.size or not (steps < 0).any():
+    if not (steps > 0).any():
         return seconds
-    longest = GAP * float(np.median(forward))
+    longest, seconds = GAP * float(np.median(steps[steps > 0])), seconds.copy()
     for period in periods:
+        steps = np.diff(seconds[there])
         over = (steps < 0) & (steps + period > 0) & (steps + period <= longest)
         if over.any():
             notes.append(
                 f"The counter of the stamps begins again after {period:.6g} s at "
                 f"{rows_text(there[1:][over])}: it goes on."
             )
-            steps = steps + period * over
-            seconds = seconds.copy()
-            seconds[there[1:]] = seconds[there[0]] + np.cumsum(steps)
+            seconds[there[1:]] += period * np.cumsum(over)
     return seconds
 
 
