@@ -394,14 +394,7 @@ def _left(features: Array, values: Vector) -> tuple[float, int]:
     return float(rest @ rest), basis.shape[1]
 
 
-PERIODS = (
-    1.0,
-    TURN,
-    360.0,
-    *(1000.0 * k for k in (1, 2, 2.4, 4, 8, 10)),
-    *2.0 ** np.arange(8, 17),
-    2.0**32,
-)
+PERIODS = (1.0, TURN, 360.0, *1e3 * np.array((1, 2, 2.4, 4, 8, 10)), *2.0 ** np.r_[8:17, 32])
 """Periods at which angles wrap: turns, radians, degrees and counts."""
 
 DIGITS = 1e-7

@@ -26,15 +26,7 @@ from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signa
 from analysis.style import number
 from dopt.errors import given_path, install_command
 from dopt.log import Log
-from dopt.log_columns import (
-    SECONDS,
-    TURN,
-    UNIT_OF_ANGLE,
-    clock_unit,
-    clocks_of,
-    columns_of,
-    count_text,
-)
+from dopt.log_columns import SECONDS, TURN, UNIT_OF_ANGLE, clock_unit, clocks_of, count_text
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
@@ -130,7 +122,7 @@ def log_of(
         )
     if states is None:
         named = inputs.values() if isinstance(inputs, Mapping) else inputs
-        taken = {*named, *clocks_of(columns_of(table), named)}
+        taken = {*named, *clocks_of(table, named)}
         taken |= {time} if isinstance(time := options.get("time"), str) else set()
         states = [
             one
@@ -558,7 +550,7 @@ def _rest(log: Log, health: Health) -> Iterator[str]:
 
 def _others(log: Log, table: pd.DataFrame) -> Iterator[str]:
     """Yield the columns that are neither states nor inputs."""
-    used = {*log.states, *log.inputs, *clocks_of(columns_of(table), log.states)}
+    used = {*log.states, *log.inputs, *clocks_of(table, log.states)}
     for name in table.columns.difference([*used], sort=False):
         if is_flag(table[name]):
             yield f"{name}: a flag, not 0 in {int((table[name] != 0).sum()):,} rows"

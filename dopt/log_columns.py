@@ -102,12 +102,13 @@ def _column(values: Any) -> npt.NDArray[Any]:
     return np.asanyarray(values)  # masked arrays stay so
 
 
-def clocks_of(table: Mapping[str, Any], taken: Collection[str]) -> list[str]:
+def clocks_of(table: Any, taken: Collection[str]) -> list[str]:
     """Return the columns of stamps, by name, or else by their dates; one of a name's equal ones."""
     named = [name for name in table if clock_unit(name) is not None and name not in taken]
     found = [name for name in named if not clock_unit(name)] or named
     if not found:
-        found = [n for n in table if n not in taken and _dates(table[n][:FIRST]).dtype.kind in "mM"]
+        few = {name: _dates(_column(table[name][:FIRST])) for name in table if name not in taken}
+        found = [name for name, values in few.items() if values.dtype.kind in "mM"]
     same = all(np.array_equal(table[name], table[found[0]]) for name in found)
     return found[: 1 if same and len({n.rsplit(".")[-1] for n in found}) == 1 else None]
 

@@ -225,14 +225,13 @@ class _Selection:
         self.table: list[tuple[str, float, float]] = []
         self.notes: list[str] = []
         self.outliers = Counter[str]()
-        self.scan: dict[float, float] = {}
         self.window = math.nan
         self._typical: float | None = None
         self._folds: dict[str, tuple[Model, list[Array]]] = {}
 
     def selection(self, seed: int) -> Selection:
         seconds = time.perf_counter() - self._began
-        told = tuple(self.table), self.window, dict(self.scan), tuple(self.notes), self.outliers
+        told = tuple(self.table), self.window, tuple(self.notes), self.outliers
         return Selection(*told, seed, seconds)
 
     def lengths(self, window: float | None) -> list[float]:
@@ -317,7 +316,6 @@ class _Selection:
             best, last = min(fits, key=lambda shift: fits[shift][0]), max(fits)
             later = range(last + 1, last + 1 + len(SCANNED) // 2) if best == last else ()
             shifts = [shift for shift in later if guess + shift * self.step <= latest]
-        self.scan = {guess + shift * self.step: fit[0] for shift, fit in fits.items()}
         if not np.isfinite(fits[best][2].squares).any():
             raise SpecificationError(
                 f"no window of {seconds:g} s of the logs can be simulated by the equations from "

@@ -69,7 +69,6 @@ class Selection(NamedTuple):
 
     table: tuple[tuple[str, float, float], ...]
     window: float  # length that was chosen [s]
-    delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
     outliers: Mapping[str, int]  # measurements that were left out, by state
     seed: int  # of the network that was tried
@@ -212,7 +211,9 @@ class Fitted:
                 f"level is {level!r}, but a share between 0 and 1 is expected: give for instance "
                 f"0.9."
             )
-        data, z = self._with(run), float(ndtri(0.5 + 0.5 * level))
+        log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
+        data = data_of(self.plant, [log], self.hold, self._deviations)
+        z = float(ndtri(0.5 + 0.5 * level))
         model, solution, _, covariance = self.chosen
         simulator, measured = Simulator(model, data), model.structure.measured
         rng, out = np.random.default_rng(self.selection.seed), []
@@ -470,10 +471,6 @@ class Fitted:
         """Return the plant as an environment of Gymnasium that begins at states of the logs."""
         return export.environment(self)
 
-    def _with(self, run: Any) -> Data:
-        log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
-        return data_of(self.plant, [log], self.hold, self._deviations)
-
     def _whole(self, data: Data, history: float | None) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""
         out = []
@@ -497,16 +494,6 @@ class Fitted:
     def _latest(self) -> float:
         values = self.chosen.model.values(self.chosen.solution.p)
         return max(values.delay, 0.0) + 3.0 * values.lag
-
-    def free_run_error(self, run: Any, *, history: float | None = None) -> dict[str, float]:
-        """Return the root mean square error of :meth:`simulate` after the history, by state."""
-        data = self._with(run)
-        rows = self._whole(data, history)
-        found = predicted(Simulator(self.chosen.model, data), self.chosen.solution.p, rows)
-        errors = np.concatenate(found.errors)
-        squares = [np.mean(np.square(column[~np.isnan(column)])) for column in errors.T]
-        names = measured_names(self.plant)
-        return {name: float(np.sqrt(each)) for name, each in zip(names, squares, strict=True)}
 
 
 def _correlation(a: Array, b: Array) -> float:
