@@ -38,8 +38,6 @@ INPUTS = re.compile(
 )
 """Columns that are taken for inputs where none are named."""
 
-_TOP = 200  # lines of a file of text, of which some may come before the names of columns
-
 LEFT_OUT = "left out"
 """Attribute of a table: a sentence on the variables of its file that are no columns."""
 
@@ -164,7 +162,7 @@ def _csv(file: Path) -> pd.DataFrame:
 
 def _csv_in(file: Path, encoding: str) -> pd.DataFrame:
     with (gzip.open if file.suffix == ".gz" else open)(file, "rt", encoding=encoding) as text:
-        top = list(itertools.islice(text, _TOP)) or [""]
+        top = list(itertools.islice(text, 200)) or [""]
     usual = top[len(top) * 3 // 4]
     mark = next((one for one in ";\t," if one in usual), r"\s+")
     rows = [re.split(mark, line.lstrip("\ufeff").strip()) for line in top]

@@ -40,16 +40,11 @@ UNIT_OF_ANGLE = re.compile(r"[\[(/_ ](deg(?:/s)?|mrad(?:/s)?|rpm)[\])]?$", re.IG
 _ROLL_OVERS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)
 """Times after which a 32-bit counter of µs or ms begins again [s]."""
 
-FIRST = 100
-"""Rows that tell whether a column holds dates."""
-
 _MISSING = ("", "na", "nan", "nat", "<na>", "n/a", "none", "null")
 
 _DATE = re.compile(
     r"(\d{4}-[01]\d-[0-3]\d(?:[ T][0-2]\d:[0-5]\d(?::[0-5]\d(?:[.,]\d+)?)?)?) ?(Z|[-+]\d\d:?\d*)?"
 )
-
-_HOURS = re.compile(r"[0-2]\d:[0-5]\d:[0-5]\d")  # of a clock without dates
 
 
 def clock_unit(name: str) -> str | None:
@@ -107,7 +102,7 @@ def clocks_of(table: Any, taken: Collection[str]) -> list[str]:
     named = [name for name in table if clock_unit(name) is not None and name not in taken]
     found = [name for name in named if not clock_unit(name)] or named
     if not found:
-        few = {name: _dates(_column(table[name][:FIRST])) for name in table if name not in taken}
+        few = {name: _dates(_column(table[name][:100])) for name in table if name not in taken}
         found = [name for name, values in few.items() if values.dtype.kind in "mM"]
     same = all(np.array_equal(table[name], table[found[0]]) for name in found)
     return found[: 1 if same and len({n.rsplit(".")[-1] for n in found}) == 1 else None]
@@ -277,7 +272,7 @@ def _dates(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return dates, texts of them in UTC, and spans of time in ns, anything else as it is."""
     if values.dtype.kind in "OUST":
         texts = [str(one).strip() for one in values]
-        texts = [f"2000-01-01 {text}" if _HOURS.match(text) else text for text in texts]
+        texts = [re.sub(r"^(?=\d\d:\d\d:\d\d)", "2000-01-01 ", text) for text in texts]
         found = [_DATE.fullmatch(one) for one in texts]
         others = {text for text, one in zip(texts, found, strict=True) if not one}
         if any(found) and all(text.lower() in _MISSING for text in others):

@@ -48,6 +48,9 @@ MOVING = 5.0
 CORRELATED = 0.7
 """Correlation of residuals with the row before from which the equations lack something."""
 
+DIVERGED = 1e300
+"""Error of a prediction that diverges, by the one that is expected."""
+
 DRAWN = 100
 """Parameters, with initial states, that bounds are drawn from: an angle may turn either way."""
 
@@ -303,8 +306,10 @@ class Fitted:
                 if not others:
                     break
                 size = errors_ahead(others, self.horizons, seconds, self._deviations)
-                for column, r, seen in zip(found, (error / size).T, change.T, strict=True):
-                    column.append(np.abs(r[np.isfinite(seen)]))
+                ratio = np.full_like(error, DIVERGED)
+                np.divide(np.abs(error), size, out=ratio, where=error < np.inf)
+                for column, r, seen in zip(found, ratio.T, change.T, strict=True):
+                    column.append(r[np.isfinite(seen)])
         return [*map(np.concatenate, found)]
 
     def coverage(self, level: float = 0.9) -> dict[str, float]:

@@ -364,6 +364,19 @@ def test_bounds_hold_what_they_say_on_another_run(fitted: Fitted) -> None:
     np.testing.assert_array_equal(read_back.simulate(other)[0].lower, simulated.lower)
 
 
+@pytest.mark.parametrize("blocks", [1, 2, 5])
+def test_bounds_are_wide_where_predictions_diverge(fitted: Fitted, blocks: int) -> None:
+    """An endless error by an endless one that is expected is no number."""
+    found = pickle.loads(pickle.dumps(fitted))
+    for part in found._held_out["model"][:blocks]:
+        for errors in part.errors:
+            errors[len(errors) // 2 :] = np.inf
+    simulated = found.simulate(dopt.Log.for_plant(run(9, 300, drag=0.4), fitted.plant))[0]
+    assert (simulated.lower < simulated.upper).all()
+    assert found.coverage()["angle"] <= fitted.coverage()["angle"]
+    assert "angle" in found.report()
+
+
 def test_a_saved_model_needs_numpy_alone(fitted: Fitted, tmp_path: Path) -> None:
     fitted.save(tmp_path / "model_0.5s")  # no ending of a name is lost
     derivative, step = loaded(EXAMPLE / "load_model.py").load(tmp_path / "model_0.5s.npz")
