@@ -167,7 +167,8 @@ def _csv_in(file: Path, encoding: str) -> pd.DataFrame:
     mark = next((one for one in ";\t," if one in usual), r"\s+")
     rows = [re.split(mark, line.lstrip("\ufeff").strip()) for line in top]
     half = (len(re.split(mark, usual.strip())) - 1) / 2  # a mark may end each line but the first
-    numbers = (sum(bool(re.match(r'\s*"?[-+.]?\d', one)) for one in row) for row in rows)
+    number = re.compile(r'\s*"?[-+.]?\d[-+.,:/ \dTZeE]*"?\s*')
+    numbers = (sum(map(bool, map(number.fullmatch, row))) for row in rows)
     data = next((k for k, n in enumerate(numbers) if n >= max(half, len(rows[k]) / 2)), 1)
     if not data:
         raise ValueError("its first line has numbers and no names of columns")

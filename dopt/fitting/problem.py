@@ -539,19 +539,16 @@ def horizon_errors(
     out = []
     for horizon in horizons:
         both = [each.at(horizon) for each in found]
-        errors = np.concatenate([error for error, _ in both])
-        changes = np.concatenate([change for _, change in both])
+        errors, changes = map(np.concatenate, zip(*both, strict=True))
         seen = np.isfinite(changes)
         if not (len(seen) and seen.any(axis=0).all()):
             continue
         row = []
         for c, here in enumerate(seen.T):
             error, change = errors[here, c], changes[here, c]
-            rms = float(np.sqrt(np.mean(np.square(error))))
-            moved = float(np.sqrt(np.mean(np.square(change))))
-            row.append(
-                HorizonError(horizon, rms, float(np.median(np.abs(error))), moved, len(error))
-            )
+            rms, moved = (float(np.sqrt(np.mean(np.square(one)))) for one in (error, change))
+            median = float(np.median(np.abs(error)))
+            row.append(HorizonError(horizon, rms, median, moved, len(error)))
         out.append(row)
     return out
 

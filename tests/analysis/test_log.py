@@ -453,6 +453,11 @@ def test_a_log_is_read_from_every_kind_of_file(name: str, tmp_path: Path) -> Non
     np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
 
 
+def test_names_may_begin_with_a_digit(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("1st u,2nd angle,t\n0.5,1,0\n0.5,1,1\n")
+    assert [*read_table(tmp_path / "run.csv")] == ["1st u", "2nd angle", "t"]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
