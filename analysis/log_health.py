@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dopt.log import Log, Piece
-from dopt.log_columns import TURN
+from dopt.log_columns import GAP, TURN
 from dopt.types import Array, Booleans, Vector
 
 LAGS = np.arange(-3, 9)
@@ -49,6 +49,9 @@ PREDICTED, ROUNDED = 0.9999, 1.0 - 1e-9
 
 SURE = 0.9
 """Share of what is left open; of a regular input the motion, which is as regular, has up to .8."""
+
+EXACT = 0.002
+"""Share of its changes that measurements leave, below which a law, with a quantum, tells them."""
 
 FAR = 7.5
 """Part of an input that its past leaves open, by its median, above which it jumps there."""
@@ -306,7 +309,8 @@ def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
 
     Rows in which the input stays as it is, such as at a limit, tell of no feedback, and its jumps,
     such as at steps of a set point, may hide what is fed back between them. The last two are of the
-    rows in which it moves, and of these between jumps where much is.
+    rows in which it moves, and of these between jumps where much is. Where a quantum hides what a
+    measurement adds to the past, changes over several rows still follow a law.
     """
     rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
     if not rows:
@@ -323,7 +327,22 @@ def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
     usual = _usual(past, now)
     between = _feedback(past[usual], seen[usual], now[usual])
     found = between if between[0] > BETWEEN else _feedback(past, seen, now)
+    if found[0] < FEEDBACK and unexplained_changes(pieces, j) < EXACT:
+        return share, 1.0, 1.0
     return share, *found
+
+
+def unexplained_changes(pieces: Sequence[Piece], j: int) -> float:
+    """Return the share of an input's changes, without jumps, that measured changes leave open."""
+    seen, changes = (
+        np.concatenate([part[_PAST:] - part[:-_PAST] for part in parts])
+        for parts in ([one.measured for one in pieces], [one.inputs[:, j] for one in pieces])
+    )
+    there = np.isfinite(seen).all(axis=1) & seen.any(axis=1)  # it moves by a quantum
+    usual = _usual(seen[there], changes[there])
+    changes, seen = changes[there][usual], seen[there][usual]
+    total = float(changes @ changes)
+    return _left(seen, changes)[0] / total if total > 0.0 and usual.mean() > 0.5 else 1.0
 
 
 def _feedback(past: Array, seen: Array, now: Vector) -> tuple[float, float]:
@@ -375,7 +394,7 @@ def _left(features: Array, values: Vector) -> tuple[float, int]:
     return float(rest @ rest), basis.shape[1]
 
 
-PERIODS = (1.0, TURN, 360.0, *(1000.0 * k for k in (1, 2, 2.4, 4, 8, 10)), *2.0 ** np.arange(8, 17))
+PERIODS = (1.0, TURN, 360.0, *1e3 * np.array((1, 2, 2.4, 4, 8, 10)), *2.0 ** np.r_[8:17, 32])
 """Periods at which angles wrap: turns, radians, degrees and counts."""
 
 DIGITS = 1e-7
@@ -474,7 +493,7 @@ def examine(log: Log) -> Health:
 
 
 def _signal(name: str, parts: Sequence[Vector]) -> Signal:
-    parts = [part[np.isfinite(part)] for part in parts]
+    parts = [run for part in parts for run in _runs(part)]
     values = np.concatenate(parts)
     levels, counts = _levels(values)
     alone, without = _alone(levels, counts)
@@ -493,6 +512,14 @@ def _signal(name: str, parts: Sequence[Vector]) -> Signal:
     period = _wrap_period(parts, high - low)
     facts = (len(levels), step, noise, at_low, at_high, period, rests, alone)
     return Signal(name, low, high, *facts)
+
+
+def _runs(values: Vector) -> list[Vector]:
+    """Return measured values, in parts where many in a row are missing."""
+    rows = np.flatnonzero(np.isfinite(values))
+    steps = np.diff(rows, prepend=rows[:1])
+    longest = GAP * float(np.median(steps)) if rows.size else 0.0
+    return np.split(values[rows], np.flatnonzero(steps > max(longest, GAP)))
 
 
 def _alone(levels: Vector, counts: Array) -> tuple[tuple[float, int] | None, tuple[Vector, Array]]:

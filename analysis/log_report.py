@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gzip
+import itertools
 import math
 import os
 import re
@@ -24,13 +26,14 @@ from analysis.log_health import FEW, MOST_ROWS, PREDICTED, Effect, Health, Signa
 from analysis.style import number
 from dopt.errors import counted, given_path, install_command
 from dopt.log import Log
-from dopt.log_columns import TURN, UNIT_OF_ANGLE, clock_unit
+from dopt.log_columns import SECONDS, TURN, UNIT_OF_ANGLE, clock_unit, clocks_of
 from dopt.systems.plant import Plant
 from orchestrate.program import UsageError, folder, path, positive, tell
 from orchestrate.store import Store
 
 INPUTS = re.compile(
-    r"(^|\.)u\d*$|input|volt|torque|^tau|current|pwm|force|throttle|command|(^|_)cmd($|_|\d)",
+    r"(^|\.)u\d*([ _]?[\[(/].*)?$|input|volt|torque|^tau|current|pwm|force|throttle|command"
+    r"|(^|_)cmd($|_|\d)",
     re.IGNORECASE,
 )
 """Columns that are taken for inputs where none are named."""
@@ -45,8 +48,9 @@ _MEASURED = re.compile(r"meas", re.IGNORECASE)
 def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
     """Return the table in a file, by the ending of its name.
 
-    ``.csv`` and ``.csv.gz`` have a line of names, and commas, tabs, or semicolons with decimal
-    commas or points; ``.parquet``; ``.mat`` of MATLAB, 7.3 included;
+    ``.csv`` and ``.csv.gz`` have a line of names, after comments and before a line of units where
+    there are such, and commas, tabs, blanks, or semicolons with decimal commas or points;
+    ``.parquet``; ``.mat`` of MATLAB, 7.3 included;
     ``.h5`` or ``.hdf5``. In the last two, variables of one length are columns, and those in a
     structure or a group are ``group.name``.
 
@@ -116,12 +120,13 @@ def log_of(
         )
     if states is None:
         named = inputs.values() if isinstance(inputs, Mapping) else inputs
-        taken = {*named, options["time"]} if isinstance(options.get("time"), str) else {*named}
+        taken = {*named, *clocks_of(table, named)}
+        taken |= {time} if isinstance(time := options.get("time"), str) else set()
         states = [
             one
             for one in map(str, table)
             if one not in taken and clock_unit(one) is None and not one.startswith("Unnamed: ")
-            if not is_flag(table[one]) and not INPUTS.search(one)
+            if not is_flag(table[one]) and not is_text(table[one]) and not INPUTS.search(one)
         ]
     log = Log(table, states=states, inputs=inputs, **options)
     if LEFT_OUT in table.attrs:
@@ -134,12 +139,18 @@ def is_flag(values: pd.Series[Any]) -> bool:
     return bool(values.dtype.kind in "biu" and values.isin([-1, 0, 1]).all())
 
 
+def is_text(values: pd.Series[Any]) -> bool:
+    """Return whether a column has words, texts without a digit, or dates."""
+    kinds, texts = r"\D*|\d{4}-\d\d-\d\d.*", values.dropna().astype(str)
+    return values.dtype.kind in "OT" and bool(texts.str.fullmatch(kinds).all())
+
+
 def _guessed_inputs(table: pd.DataFrame) -> list[str]:
     """Return columns named like inputs; of commanded and measured ones the measured."""
-    found = [str(one) for one in table if INPUTS.search(str(one))]
-    measured = [one for one in found if _MEASURED.search(str(one))]
+    found = [one for one in map(str, table) if INPUTS.search(one) and clock_unit(one) is None]
+    measured = [one for one in found if _MEASURED.search(one)]
     rest = [one for one in found if one not in measured]
-    return measured if measured and all(_COMMANDED.search(str(one)) for one in rest) else found
+    return measured if measured and all(_COMMANDED.search(one) for one in rest) else found
 
 
 def _csv(file: Path) -> pd.DataFrame:
@@ -150,17 +161,33 @@ def _csv(file: Path) -> pd.DataFrame:
 
 
 def _csv_in(file: Path, encoding: str) -> pd.DataFrame:
-    names = [str(one) for one in pd.read_csv(file, nrows=0, encoding=encoding)]
-    if all(re.fullmatch(r"[-+.,;\t\de]+", one) for one in names):
+    with (gzip.open if file.suffix == ".gz" else open)(file, "rt", encoding=encoding) as text:
+        top = list(itertools.islice(text, 200)) or [""]
+    usual = top[len(top) * 3 // 4]
+    mark = next((one for one in ";\t," if one in usual), r"\s+")
+    rows = [re.split(mark, line.lstrip("\ufeff").strip()) for line in top]
+    half = (len(re.split(mark, usual.strip())) - 1) / 2  # a mark may end each line but the first
+    number = re.compile(r'\s*"?[-+.]?\d[-+.,:/ \dTZeE]*"?\s*')
+    numbers = (sum(map(bool, map(number.fullmatch, row))) for row in rows)
+    data = next((k for k, n in enumerate(numbers) if n >= max(half, len(rows[k]) / 2)), 1)
+    if not data:
         raise ValueError("its first line has numbers and no names of columns")
-    mark = next((one for one in ";\t" if len(names) == 1 and one in names[0]), ",")
+    units = [one.strip(' []()"') for one in rows[data - 1]]
+    alike = data > 1 and len(rows[data - 2]) == len(units)
+    has_units = alike and not SECONDS.keys().isdisjoint(units)
+    skipped = [k for k in range(data) if k != data - 1 - has_units]
+    options: Any = {"encoding": encoding, "skiprows": skipped, "skipinitialspace": True}
     decimal = "," if mark == ";" else "."
-    table = pd.read_csv(file, sep=mark, decimal=decimal, encoding=encoding, skipinitialspace=True)
+    table: pd.DataFrame = pd.read_csv(file, sep=mark, decimal=decimal, **options)
     if not isinstance(table.index, pd.RangeIndex):  # the first values of longer rows
         if table.iloc[:, -1].notna().any():
             raise ValueError("its rows have more values than its first line has names")
         table = table.reset_index().iloc[:, : len(table.columns)].set_axis(table.columns, axis=1)
-    return table.rename(columns=str.strip)
+    table.columns = [one.strip().lstrip("#%").strip() for one in table.columns]
+    if has_units:
+        both = zip(table.columns, units, strict=False)
+        table.columns = [f"{name} [{unit}]" if unit else name for name, unit in both]
+    return table
 
 
 def _mat(file: Path) -> pd.DataFrame:
@@ -442,6 +469,8 @@ def _units(one: Signal, declared: bool) -> Iterator[str]:
     if not math.isnan(one.period):
         unit = {1.0: "rev", TURN: "rad", 360.0: "deg"}.get(one.period, f"counts/{one.period:.0f}")
         words = {"rad": "name it in --angles"}.get(unit, f"--angles and --units {one.name}={unit}")
+        if one.period >= 2.0**16:
+            words = f"or a counter? --units {one.name}=counts/N, N a turn"
         yield f"{one.name}: wraps about every {one.period:.6g}: an angle in {unit}? {words}"
     elif declared:
         return
@@ -513,17 +542,19 @@ def _rest(log: Log, health: Health) -> Iterator[str]:
     )
     yield (
         f"rest: nothing moves in {100 * rests.mean():.0f} % of the log, in {longest} % of it on "
-        f"end, with {acts} there: dry friction, held or without power; little is learned there"
+        f"end, with {acts} there: dry friction, held, regulated or without power; little is "
+        f"learned there"
     )
 
 
 def _others(log: Log, table: pd.DataFrame) -> Iterator[str]:
     """Yield the columns that are neither states nor inputs."""
-    used = {*log.states, *log.inputs}
-    for name in table:
-        values = table[name]
-        if is_flag(values) and name not in used:
-            yield f"{name}: a flag, not 0 in {int((values != 0).sum()):,} rows"
+    used = {*log.states, *log.inputs, *clocks_of(table, log.states)}
+    for name in table.columns.difference([*used], sort=False):
+        if is_flag(table[name]):
+            yield f"{name}: a flag, not 0 in {int((table[name] != 0).sum()):,} rows"
+        elif is_text(table[name]):
+            yield f"{name}: words, not used"
 
 
 FIT_HELP = "fit a plant's unknown constants and a network to recorded runs: report, picture, model"

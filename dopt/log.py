@@ -21,6 +21,7 @@ from dopt.log_columns import (
     TURN,
     clock_column,
     clock_unit,
+    clocks_of,
     columns_of,
     continued,
     rows_text,
@@ -73,7 +74,7 @@ class Log:
     - A row that repeats the stamp of the row before it is left out.
     - A row with an earlier stamp is left out if the row after it goes on behind the row before it;
       otherwise the clock was started again, and a new piece begins.
-    - A 32-bit counter of µs or ms that begins again goes on.
+    - A counter of 32 or 16 bits that begins again goes on.
     - A piece ends before a row without time or input, and at a gap.
     - A missing measurement stays missing: its row is kept. So does one that one or two rows long is
       far from those around it, by what is usual there: an outlier, also of whole turns.
@@ -89,7 +90,8 @@ class Log:
         these differ.
     time : str or array, optional
         Column of the stamps, or the stamps: numbers, dates or spans of time. Without it, a column
-        called time, t, timestamp or Zeit is taken, with a unit or without: ``time_ms``, ``t [s]``.
+        called time, t, timestamp or Zeit is taken, with a unit or without: ``time_ms``, ``t [s]``,
+        or the only one of dates, such as the index of a DataFrame.
         Times count from the first stamp.
     dt : float, optional
         Time between two rows [s] of a table without stamps.
@@ -207,7 +209,7 @@ class Log:
             )
         notes = []
         taken = {*found.values(), *(renamed.get(name, name) for name in plant.inputs)}
-        if time is None and dt is None and {*map(clock_unit, {*table} - taken)} <= {None}:
+        if time is None and dt is None and not clocks_of(table, taken):
             dt = float(plant.dt)
             notes.append(
                 f"No column of stamps (--time): rows are the plant's dt of {dt:g} s apart."

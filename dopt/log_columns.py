@@ -31,7 +31,7 @@ SECONDS |= {"min": 60.0, "h": 3600.0}
 """Units of time [s]."""
 
 _CLOCK = re.compile(
-    r"(?!(?-i:T)_|.*_(?:min|h)$)(?:time|t|timestamp|zeit)"  # no temperature, no minimum
+    r"(?!(?-i:T)_|.*_(?:min|h)$)(?:time|t|timestamp|zeit|epoch|utc|tick)"  # no minimum
     rf"(?:(?:\s*[\[(/]|\s+in|_|\s)\s*({'|'.join(SECONDS)})\s*[\])]?)?",
     re.IGNORECASE,
 )
@@ -71,6 +71,8 @@ def columns_of(data: Any, names: Sequence[str] | None = None) -> dict[str, npt.N
         table = {str(name): array[:, i] for i, name in enumerate(names)}
     elif hasattr(data, "columns"):
         table = {str(name): _column(data[name]) for name in data.columns}
+        if getattr(data.index, "dtype", np.dtype(int)).kind in "mM":  # of pandas, of stamps
+            table.setdefault(str(data.index.name or "time"), _column(data.index))
     elif isinstance(data, Mapping):
         table = {str(name): _column(values) for name, values in data.items()}
     else:
@@ -95,12 +97,22 @@ def _column(values: Any) -> npt.NDArray[Any]:
     return np.asanyarray(values)  # masked arrays stay so
 
 
+def clocks_of(table: Any, taken: Collection[str]) -> list[str]:
+    """Return the columns of stamps, by name, or else by their dates; one of a name's equal ones."""
+    named = [name for name in table if clock_unit(name) is not None and name not in taken]
+    found = [name for name in named if not clock_unit(name)] or named
+    if not found:
+        few = {name: _dates(_column(table[name][:100])) for name in table if name not in taken}
+        found = [name for name, values in few.items() if values.dtype.kind in "mM"]
+    same = all(np.array_equal(table[name], table[found[0]]) for name in found)
+    return found[: 1 if same and len({n.rsplit(".")[-1] for n in found}) == 1 else None]
+
+
 def clock_column(
     table: Mapping[str, Any], taken: Collection[str], time: Any, dt: float | None, notes: list[str]
 ) -> str | None:
     """Return the name of the column of the stamps, None where they are given or made of dt."""
-    clocks = [name for name in table if clock_unit(name) is not None and name not in taken]
-    found = [name for name in clocks if not clock_unit(name)] or clocks
+    found = clocks_of(table, taken) if time is None else []
     if time is not None and dt is not None:
         raise SpecificationError(
             f"a log has the time {time if isinstance(time, str) else 'of an array'!r} and dt = "
@@ -179,8 +191,9 @@ def _number(name: str, row: int, value: Any) -> float:
             hint = "write a decimal point (in pandas: read_csv(..., decimal=','))"
         elif re.search(r"\d[/.:]\d+[/.:]\d", text):
             hint = "write dates as 2026-11-29 12:30:00.5 (in pandas: to_datetime)"
-        elif row == 0 and not re.search(r"\d", text):
-            hint = "remove the row, if it holds units, and give them as units"
+        elif not re.search(r"\d", text):
+            hint = "remove the row, if it holds units, and give them as units; " * (row == 0)
+            hint += "write words as numbers, such as 0 for OFF, or leave the column out"
         raise SpecificationError(
             f"column {name!r} of a log is {text!r} in row {row}, but a number is expected: {hint}."
         ) from None
@@ -198,14 +211,15 @@ def values_of(
     factor = _factor(name, units[name], UNITS)
     notes.append(f"Column {name!r} is multiplied by {factor:.6g} ({units[name]}).")
     if str(units[name]).startswith("count"):
-        for bits in (16, 32):
-            jumps = int((np.abs(np.diff(found[np.isfinite(found)])) > 0.9 * 2.0**bits).sum())
-            if jumps:
-                notes.append(
-                    f"The counter of {bits} bits in column {name!r} begins again "
-                    f"{counted(jumps, 'time')}: it goes on."
-                )
-                found = continued(found, 2.0**bits)
+        steps = np.abs(np.diff(found[np.isfinite(found)]))
+        bits = 32 if steps.max(initial=0.0) > 0.9 * 2.0**32 else 16
+        if jumps := int((steps > 0.9 * 2.0**bits).sum()):
+            notes.append(
+                f"The counter of {bits} bits in column {name!r} begins again "
+                f"{counted(jumps, 'time')}: it goes on, from its value nearest to 0."
+            )
+            found = continued(found, 2.0**bits)
+            found -= 2.0**bits * np.round(found[np.isfinite(found)][0] / 2.0**bits)
     return found * factor
 
 
@@ -251,13 +265,14 @@ def stamps_of(
         seconds = (values.astype(object) - int(values.flat[0])).astype(np.float64) * factor
     else:
         seconds = _numbers(name, values) * factor
-    return _going_on(seconds, (2.0**32 * factor, *_ROLL_OVERS), notes)
+    return _going_on(seconds, (2.0**32 * factor, 2.0**16 * factor, *_ROLL_OVERS), notes)
 
 
 def _dates(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return dates, texts of them in UTC, and spans of time in ns, anything else as it is."""
     if values.dtype.kind in "OUST":
         texts = [str(one).strip() for one in values]
+        texts = [re.sub(r"^(?=\d\d:\d\d:\d\d)", "2000-01-01 ", text) for text in texts]
         found = [_DATE.fullmatch(one) for one in texts]
         others = {text for text, one in zip(texts, found, strict=True) if not one}
         if any(found) and all(text.lower() in _MISSING for text in others):
@@ -293,20 +308,18 @@ def _going_on(seconds: Array, periods: Sequence[float], notes: list[str]) -> Arr
     """Return stamps of a 32-bit counter that began again as if it had gone on."""
     there = np.flatnonzero(np.isfinite(seconds))
     steps = np.diff(seconds[there])
-    forward = steps[steps > 0]
-    if not forward.size or not (steps < 0).any():
+    if not (steps > 0).any():
         return seconds
-    longest = GAP * float(np.median(forward))
+    longest, seconds = GAP * float(np.median(steps[steps > 0])), seconds.copy()
     for period in periods:
+        steps = np.diff(seconds[there])
         over = (steps < 0) & (steps + period > 0) & (steps + period <= longest)
         if over.any():
             notes.append(
                 f"The counter of the stamps begins again after {period:.6g} s at "
                 f"{rows_text(there[1:][over])}: it goes on."
             )
-            steps = steps + period * over
-            seconds = seconds.copy()
-            seconds[there[1:]] = seconds[there[0]] + np.cumsum(steps)
+            seconds[there[1:]] += period * np.cumsum(over)
     return seconds
 
 

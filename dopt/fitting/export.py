@@ -8,6 +8,7 @@ first one. Numbers of the fit are assessments (:data:`FIT_MEASURES`).
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import math
@@ -18,13 +19,16 @@ from typing import Any
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.fitting.model import Model, data_of
+from dopt.fitting.model import data_of
 from dopt.fitting.problem import Simulator
 from dopt.fitting.simulation import Data
 from dopt.result import Assessment, TrialResult
 from dopt.spec.config import config_label
 from dopt.spec.trial import FIT_MARK, MarkedTrial, marked_json
 from dopt.types import Array, Integers
+
+SETTLED = 40.0
+"""Time constants of the lag after which nothing is left of an earlier input in a double."""
 
 
 def save(found: Any, path: str | Path) -> None:
@@ -121,10 +125,12 @@ def environment(found: Any) -> Any:
             "pip install gymnasium."
         ) from error
 
-    model, p = found.chosen.model, found.chosen.solution.p
-    values, plant = model.values(p), found.plant
-    starts = found.chosen.solution.windows.starts
-    bound = min(plant.gamma, plant.supply)
+    plant, p, model = found.plant, found.chosen.solution.p, copy.copy(found.chosen.model)
+    values, starts = model.values(p), found.chosen.solution.windows.starts
+    limits, bound = model.structure.limits, min(plant.gamma, plant.supply)
+    model.structure = model.structure._replace(limits=np.full(model.d, np.inf))
+    n = math.ceil((max(values.delay, 0.0) + SETTLED * values.lag) / plant.dt - 1e-9) + 2
+    rows, nothing = np.arange(n), np.full((n, len(found.data.deviations)), np.nan)
 
     class FittedPlant(gymnasium.Env):  # type: ignore[misc]  # of a library that may lack
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (model.d,), np.float64)
@@ -137,54 +143,19 @@ def environment(found: Any) -> Any:
             given = (options or {}).get("state")
             drawn = starts[self.np_random.integers(len(starts))]
             self.state = np.array(drawn if given is None else given, float)
-            kept = math.ceil(max(values.delay, 0.0) / plant.dt - 1e-9) + 1
-            self._asked = [np.zeros(model.m)] * kept
-            self._acting = np.zeros(model.m)
+            self._asked = [np.zeros(model.m)] * (n - 1)  # the newest first
             return self.state.copy(), {}
 
         def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
             u = np.clip(np.asarray(action, float).reshape(model.m), -plant.supply, plant.supply)
             self._asked = [u, *self._asked[:-1]]
-            for seconds, row in acting(max(values.delay, 0.0), plant.dt):
-                self.state, self._acting = advance(
-                    model, p, values.lag, self.state, self._acting, self._asked[row], seconds
-                )
-            inside = bool(np.all(np.abs(self.state) <= model.structure.limits))
+            inputs, ends = np.array([*self._asked[::-1], u]), (0 * rows, rows[-1] + 0 * rows)
+            data = Data(plant.dt * rows, nothing, inputs, *ends, found.data.deviations)
+            self.state = Simulator(model, data).states(p, n - 2, n - 1, self.state)[-1]
+            inside = bool(np.all(np.abs(self.state) <= limits))
             return self.state.copy(), 0.0, not inside, False, {}
 
     return FittedPlant()
-
-
-def acting(delay: float, dt: float) -> list[tuple[float, int]]:
-    """Return for how long [s] the input of how many steps before acts in a step, in their order."""
-    whole = math.floor(delay / dt + 1e-9)
-    part = max(delay - whole * dt, 0.0)
-    if part < 1e-9 * dt:
-        return [(dt, whole)]
-    return [(part, whole + 1), (dt - part, whole)]
-
-
-def advance(
-    model: Model, p: Array, lag: float, x: Array, v: Array, u: Array, seconds: float
-) -> tuple[Array, Array]:
-    """Return the state and what acts after a time under an input that is held."""
-
-    def acts(s: float) -> Array:
-        return u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
-
-    def rate(state: Array, s: float) -> Array:
-        flow: Array = model.derivative(p, state[None], acts(s)[None])[0]
-        return flow
-
-    steps = max(1, math.ceil(seconds / model.structure.longest_step - 1e-9))
-    h = seconds / steps
-    for i in range(steps):
-        k1 = rate(x, i * h)
-        k2 = rate(x + 0.5 * h * k1, (i + 0.5) * h)
-        k3 = rate(x + 0.5 * h * k2, (i + 0.5) * h)
-        k4 = rate(x + h * k3, (i + 1) * h)
-        x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    return x, acts(seconds)
 
 
 FIT_MEASURES = {

@@ -33,7 +33,7 @@ from scipy.optimize import minimize_scalar
 from dopt.arguments import instance, whole
 from dopt.errors import SpecificationError, counted
 from dopt.fitting.fitted import Estimate, Fitted, Selection
-from dopt.fitting.model import Layout, Model, data_of
+from dopt.fitting.model import Layout, Model, data_of, measured_names
 from dopt.fitting.problem import (
     FEWEST,
     HORIZONS,
@@ -161,6 +161,16 @@ def fit(
     plant = measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
+    seen, given = map(_still, (measured_names(plant), plant.inputs), (data.measured, data.inputs))
+    if len(seen) == data.measured.shape[1]:
+        raise SpecificationError(
+            f"nothing that was measured ({', '.join(seen)}) changes in the logs, but a motion is "
+            f"expected: correct the columns, or give a run in which the plant moves."
+        )
+    work.notes += [
+        f"{name} never changes in the logs: constants that need it to stay near their guesses"
+        for name in (*seen, *given)
+    ]
     work.outliers = sum((run.outliers for run in runs), work.outliers)
     work.notes += [
         f"{counted(number, 'outlier')} of {name} left out" for name, number in work.outliers.items()
@@ -213,14 +223,13 @@ class _Selection:
         self.table: list[tuple[str, float, float]] = []
         self.notes: list[str] = []
         self.outliers = Counter[str]()
-        self.scan: dict[float, float] = {}
         self.window = math.nan
         self._typical: float | None = None
         self._folds: dict[str, tuple[Model, list[Array]]] = {}
 
     def selection(self, seed: int) -> Selection:
         seconds = time.perf_counter() - self._began
-        told = tuple(self.table), self.window, dict(self.scan), tuple(self.notes), self.outliers
+        told = tuple(self.table), self.window, tuple(self.notes), self.outliers
         return Selection(*told, seed, seconds)
 
     def lengths(self, window: float | None) -> list[float]:
@@ -305,7 +314,12 @@ class _Selection:
             best, last = min(fits, key=lambda shift: fits[shift][0]), max(fits)
             later = range(last + 1, last + 1 + len(SCANNED) // 2) if best == last else ()
             shifts = [shift for shift in later if guess + shift * self.step <= latest]
-        self.scan = {guess + shift * self.step: fit[0] for shift, fit in fits.items()}
+        if not np.isfinite(fits[best][2].squares).any():
+            raise SpecificationError(
+                f"no window of {seconds:g} s of the logs can be simulated by the equations from "
+                f"states that fit it, but some are expected to stay finite and within the plant's "
+                f"limit: correct units, zeros of the measured states or guesses of the constants."
+            )
         self.say(f"delay: {best:+d} samples from the guess fit best")
         if isinstance(declared, Unknown):
             self.delay += best * self.step
@@ -544,6 +558,12 @@ def same_rows(rows: Integers, data: Data, other: Data) -> Integers:
     return moved
 
 
+def _still(names: Iterable[str], columns: Array) -> list[str]:
+    """Return the columns, (N, n), that never change, by name."""
+    ranges = np.nanmax(columns, axis=0) - np.nanmin(columns, axis=0)
+    return [name for name, found in zip(names, ranges, strict=True) if found == 0.0]
+
+
 def _gain(before: Array, after: Array) -> tuple[float, float]:
     """Return the mean fall of the held-out losses of the blocks, and its standard error."""
     fall = before - after
@@ -630,14 +650,9 @@ def _blocks(data: Data, runs: Sequence[Log]) -> list[tuple[int, int]]:
 
 
 def rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Integers]:
-    pieces = np.split(np.arange(len(data.time)), np.unique(data.firsts)[1:])
-    out: list[Integers] = []
-    at = 0
-    for run in runs:
-        n = sum(len(piece.time) > 1 for piece in run.pieces)
-        out.append(np.concatenate(pieces[at : at + n]) if n else np.arange(0))
-        at += n
-    return out
+    pieces = iter(np.split(np.arange(len(data.time)), np.unique(data.firsts)[1:]))
+    counts = (sum(len(piece.time) > 1 for piece in run.pieces) for run in runs)
+    return [np.concatenate([np.arange(0), *itertools.islice(pieces, n)]) for n in counts]
 
 
 def logs_of(plant: Plant, given: Any) -> list[Log]:

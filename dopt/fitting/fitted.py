@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from dopt.errors import SpecificationError, counted
+from dopt.fitting import export
 from dopt.fitting.model import Model, data_of, measured_names
 from dopt.fitting.problem import (
     FEWEST,
@@ -46,6 +47,9 @@ MOVING = 5.0
 CORRELATED = 0.7
 """Correlation of residuals with the row before from which the equations lack something."""
 
+DIVERGED = 1e300
+"""Error of a prediction that diverges, by the one that is expected."""
+
 DRAWN = 100
 """Parameters, with initial states, that bounds are drawn from: an angle may turn either way."""
 
@@ -67,7 +71,6 @@ class Selection(NamedTuple):
 
     table: tuple[tuple[str, float, float], ...]
     window: float  # length that was chosen [s]
-    delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
     outliers: Mapping[str, int]  # measurements that were left out, by state
     seed: int  # of the network that was tried
@@ -210,7 +213,9 @@ class Fitted:
                 f"level is {level!r}, but a share between 0 and 1 is expected: give for instance "
                 f"0.9."
             )
-        data, z = self._with(run), float(ndtri(0.5 + 0.5 * level))
+        log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
+        data = data_of(self.plant, [log], self.hold, self._deviations)
+        z = float(ndtri(0.5 + 0.5 * level))
         model, solution, _, covariance = self.chosen
         simulator, measured = Simulator(model, data), model.structure.measured
         rng, out = np.random.default_rng(self.selection.seed), []
@@ -300,8 +305,10 @@ class Fitted:
                 if not others:
                     break
                 size = errors_ahead(others, self.horizons, seconds, self._deviations)
-                for column, r, seen in zip(found, (error / size).T, change.T, strict=True):
-                    column.append(np.abs(r[np.isfinite(seen)]))
+                ratio = np.full_like(error, DIVERGED)
+                np.divide(np.abs(error), size, out=ratio, where=error < np.inf)
+                for column, r, seen in zip(found, ratio.T, change.T, strict=True):
+                    column.append(r[np.isfinite(seen)])
         return [*map(np.concatenate, found)]
 
     def coverage(self, level: float = 0.9) -> dict[str, float]:
@@ -444,9 +451,8 @@ class Fitted:
             If the package orchestrate is not installed.
         """
         from dopt.explorer.saving import new_saver
-        from dopt.fitting.export import FittedTrial
 
-        trial, saver = FittedTrial(self), new_saver(url)
+        trial, saver = export.FittedTrial(self), new_saver(url)
         try:
             saver.save(trial, trial.result)
         finally:
@@ -455,29 +461,19 @@ class Fitted:
 
     def save(self, path: str | Path) -> None:
         """Write the model as arrays (.npz), which NumPy alone reads; pickle keeps the whole fit."""
-        from dopt.fitting.export import save
-
         if "://" in str(path):
             raise SpecificationError(
                 "path is the URL of a database, but a file is expected: give the URL to store()."
             )
-        save(self, path)
+        export.save(self, path)
 
     def to_torch(self) -> Any:
         """Return dx/dt as a module of PyTorch, whose parameters are constants and weights."""
-        from dopt.fitting.export import to_torch
-
-        return to_torch(self)
+        return export.to_torch(self)
 
     def environment(self) -> Any:
         """Return the plant as an environment of Gymnasium that begins at states of the logs."""
-        from dopt.fitting.export import environment
-
-        return environment(self)
-
-    def _with(self, run: Any) -> Data:
-        log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
-        return data_of(self.plant, [log], self.hold, self._deviations)
+        return export.environment(self)
 
     def _whole(self, data: Data, history: float | None) -> Integers:
         """Return first row, last row of the history and last row of the pieces of data."""
@@ -502,16 +498,6 @@ class Fitted:
     def _latest(self) -> float:
         values = self.chosen.model.values(self.chosen.solution.p)
         return max(values.delay, 0.0) + 3.0 * values.lag
-
-    def free_run_error(self, run: Any, *, history: float | None = None) -> dict[str, float]:
-        """Return the root mean square error of :meth:`simulate` after the history, by state."""
-        data = self._with(run)
-        rows = self._whole(data, history)
-        found = predicted(Simulator(self.chosen.model, data), self.chosen.solution.p, rows)
-        errors = np.concatenate(found.errors)
-        squares = [np.mean(np.square(column[~np.isnan(column)])) for column in errors.T]
-        names = measured_names(self.plant)
-        return {name: float(np.sqrt(each)) for name, each in zip(names, squares, strict=True)}
 
 
 def _correlation(a: Array, b: Array) -> float:

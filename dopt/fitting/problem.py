@@ -17,8 +17,9 @@ Predictions of parts of a log are at the end, with a linear model for comparison
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numba
@@ -212,17 +213,10 @@ class Simulator:
         return Linear(normal, slope, T, C, g, scores, parts)
 
 
-def _batches(sizes: Integers) -> list[tuple[int, int]]:
+def _batches(sizes: Integers) -> Iterator[tuple[int, int]]:
     """Return ranges of windows of about ``BATCH_ROWS`` rows each."""
-    out, first, total = [], 0, 0
-    for k, size in enumerate(sizes):
-        total += size
-        if total >= BATCH_ROWS:
-            out.append((first, k + 1))
-            first, total = k + 1, 0
-    if first < len(sizes):
-        out.append((first, len(sizes)))
-    return out
+    batch = np.cumsum(sizes) // BATCH_ROWS
+    return itertools.pairwise([0, *(np.flatnonzero(np.diff(batch, append=-1)) + 1).tolist()])
 
 
 class Solution(NamedTuple):
@@ -545,19 +539,16 @@ def horizon_errors(
     out = []
     for horizon in horizons:
         both = [each.at(horizon) for each in found]
-        errors = np.concatenate([error for error, _ in both])
-        changes = np.concatenate([change for _, change in both])
+        errors, changes = map(np.concatenate, zip(*both, strict=True))
         seen = np.isfinite(changes)
         if not (len(seen) and seen.any(axis=0).all()):
             continue
         row = []
         for c, here in enumerate(seen.T):
             error, change = errors[here, c], changes[here, c]
-            rms = float(np.sqrt(np.mean(np.square(error))))
-            moved = float(np.sqrt(np.mean(np.square(change))))
-            row.append(
-                HorizonError(horizon, rms, float(np.median(np.abs(error))), moved, len(error))
-            )
+            rms, moved = (float(np.sqrt(np.mean(np.square(one)))) for one in (error, change))
+            median = float(np.median(np.abs(error)))
+            row.append(HorizonError(horizon, rms, median, moved, len(error)))
         out.append(row)
     return out
 

@@ -15,11 +15,21 @@ import numpy.typing as npt
 import pandas as pd
 import pytest
 from scipy.io import savemat
+from scipy.signal import lfilter
 
 import analysis
 from analysis import cli
 from analysis.data.matching import AnalysisError
-from analysis.log_health import MOST_ROWS, Effect, Health, effects, examine, quantum
+from analysis.log_health import (
+    EXACT,
+    MOST_ROWS,
+    Effect,
+    Health,
+    effects,
+    examine,
+    quantum,
+    unexplained_changes,
+)
 from analysis.log_report import lines, log_of, read_table
 from dopt.errors import SpecificationError
 from dopt.log import Log
@@ -179,6 +189,31 @@ def test_a_smooth_input_of_a_controller_is_not_called_open_loop(seed: int) -> No
     assert effect.closed_loop or effect.may_be_closed
 
 
+@pytest.mark.parametrize("step", [1e-6, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize(("gain", "fluid"), [(3, 14), (9, 60)])
+def test_feedback_without_noise_is_seen_through_the_steps_of_a_scale(
+    step: float, gain: float, fluid: float
+) -> None:
+    """The steps hide what a measurement adds to the past, but not the law between set points."""
+    (place, speed), found = (0.1, 0.0), []
+    for wanted in np.repeat(np.random.default_rng(0).uniform(-0.15, 0.15, 27), 150):
+        found.append((round(place / step) * step, gain * (wanted - place)))
+        for _ in range(10):
+            place, speed = place + 1e-3 * speed, speed + 1e-3 * fluid * (0.9 * found[-1][1] - speed)
+    effect = one_effect(*np.array(found).T, "x")
+    assert effect.closed_loop or effect.may_be_closed
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_law_is_seen_in_inputs_that_were_chosen_before(seed: int) -> None:
+    rng, t = np.random.default_rng(seed), np.arange(4000) * DT
+    levels = np.repeat(rng.uniform(-1, 1, 40), 100)
+    tones = np.sin(np.outer(t, (1.9, 4.4, 6.9)) + rng.uniform(0, 6, 3)).sum(axis=1)
+    for u in (levels, held(rng, 4000), smooth(rng, 4000), tones, lfilter([1], [20, -19], levels)):
+        found = log_of(pd.DataFrame({"t": t, "th": motor(u, step=1e-4), "u": u}))
+        assert unexplained_changes(found.pieces, 0) > 50 * EXACT
+
+
 @pytest.mark.parametrize("slower", [2, 3, 10])
 def test_a_slow_sensor_beside_a_fast_one_is_no_defect(slower: int) -> None:
     """Where no two rows that follow each other have all states, no effect is judged."""
@@ -290,6 +325,24 @@ def test_a_number_that_stands_for_a_missing_one_is_said_and_left_out() -> None:
     assert "far from" not in whole
 
 
+def test_a_rate_with_a_gap_does_not_wrap() -> None:
+    """The way over missing values was taken for the end of a turn."""
+    rate = 3 * np.sin(2 * np.arange(2000) * DT)
+    rate[940:1000] = np.nan  # from its least to its largest value
+    assert "wraps" not in report({"t": np.arange(2000) * DT, "v": rate, "u": rate + 1})
+    rate[941:1000:20] = 0.0
+    assert "wraps" not in report({"t": np.arange(2000) * DT, "v": rate, "u": rate + 1})
+
+
+def test_words_dates_and_names_with_units_do_no_harm() -> None:
+    t = np.arange(50.0) * DT
+    table = pd.DataFrame({"t": t, "th": t, "u [V]": t, "mode": "manual", "date": "2026-03-01"})
+    table["note"] = ["begin", *[np.nan] * 49]
+    log = log_of(table)
+    assert (log.states, log.inputs) == (("th",), ("u [V]",))
+    assert "mode: words, not used" in lines(log, examine(log), table)
+
+
 def test_columns_that_are_named_like_inputs_are_and_flags_are_not_states() -> None:
     t = np.arange(50.0) * DT
     base = {"Time": t, "th": t, "ok": np.ones(50, dtype=bool)}
@@ -344,9 +397,31 @@ def scope() -> dict[str, Any]:
     return {"time": frame().t, "signals": signals}
 
 
+def comma() -> str:
+    return str(frame().to_csv(index=False))
+
+
+def dated() -> pd.DataFrame:
+    """Return a table with dates for an index, as data bases keep it."""
+    index = pd.Timestamp("2026-06-01") + pd.to_timedelta(frame().t, unit="s")
+    return frame().drop(columns="t").set_index(pd.DatetimeIndex(index, name="when"))
+
+
+def series(name: str) -> dict[str, Any]:
+    """Return what MATLAB keeps of one signal, with its own copy of the stamps."""
+    return {"time": frame().t.to_numpy(), name: frame()[name].to_numpy()}
+
+
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "run.csv": lambda path: frame().to_csv(path, index=False),
     "run.csv.gz": lambda path: frame().to_csv(path, index=False),
+    "comments.csv": lambda path: path.write_text(f"# rig 3, tilted\n\n{comma()}"),
+    "preamble.csv": lambda path: path.write_text(f"Rig 3\nrate, 100, Hz\n\n{comma()}"),
+    "commented_names.csv": lambda path: path.write_text(f"#{comma()}"),
+    "units.csv": lambda path: path.write_text(comma().replace("\n", "\n[s],,\n", 1)),
+    "blank.csv": lambda path: path.write_text(comma().replace(",", "  ")),
+    "dated.parquet": lambda path: dated().to_parquet(path),
+    "clocks.mat": lambda path: savemat(path, {n: series(n) for n in ("th", "u")}),
     "semicolons.csv": lambda path: frame().to_csv(path, index=False, sep=";", decimal=","),
     "points.csv": lambda path: frame().to_csv(path, index=False, sep=";"),
     "tabs.csv": lambda path: frame().to_csv(path, index=False, sep="\t"),
@@ -378,12 +453,17 @@ def test_a_log_is_read_from_every_kind_of_file(name: str, tmp_path: Path) -> Non
     np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
 
 
+def test_names_may_begin_with_a_digit(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("1st u,2nd angle,t\n0.5,1,0\n0.5,1,1\n")
+    assert [*read_table(tmp_path / "run.csv")] == ["1st u", "2nd angle", "t"]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
         ("run.txt", b"", r"ends with .txt, but a log is read from .csv"),
         ("none.csv", None, "is no file"),
-        ("run.csv", b"# rig 3\nt,th,u\n0,1,2\n", "in UTF-8 with one line of names"),
+        ("run.csv", b"# rig 3\n0,1,2\n", "cannot be read"),
         ("run.csv", b"0,1.5,2\n0.01,1.6,2\n", "first line has numbers and no names"),
         ("run.csv", b"t,th,u\n", "has no rows"),
         ("run.csv", b"", "cannot be read"),

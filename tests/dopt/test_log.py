@@ -140,6 +140,26 @@ def test_a_counter_of_microseconds_that_begins_again_goes_on() -> None:
         [piece] = found.pieces
         np.testing.assert_allclose(piece.time, T, atol=1e-9)
         assert said(found, "begins again after 4294.97 s at row 100")
+    short = log(table(t=(np.arange(N) * 10 + 64_900).astype(np.uint16)), units={"t": "ms"})
+    np.testing.assert_allclose(short.pieces[0].time, np.arange(N) * 0.01, atol=1e-9)
+
+
+def test_dates_are_stamps_where_no_column_is_named_like_a_clock() -> None:
+    frame = pd.DataFrame(table()).drop(columns="t")
+    dates = pd.Timestamp("2026-03-01") + pd.to_timedelta(T, "s")
+    clock, text = [f"{one:%H:%M:%S.%f}" for one in dates], [one.isoformat(" ") for one in dates]
+    for given in (
+        frame.set_index(pd.DatetimeIndex(dates, name="when")),
+        frame.set_index(pd.TimedeltaIndex(dates - dates[0])),
+        frame.assign(when=dates),
+        frame.assign(logged=text),
+        frame.assign(time=clock),
+        frame.assign(**{"a.time": T, "b.time": T}),
+    ):
+        [piece] = log(given).pieces
+        np.testing.assert_allclose(piece.time, T, atol=1e-8)
+        [piece] = Log.for_plant(given, motor(), columns={"angle": "th", "v": "u"}).pieces
+        np.testing.assert_allclose(piece.time, T, atol=1e-8)
 
 
 def test_a_repeated_stamp_leaves_out_the_later_row() -> None:
@@ -258,6 +278,11 @@ def test_counts_become_radians_and_counters_go_on() -> None:
         found = log(table(th=raw), angles=["th"], units={"th": f"counts/{per_turn}"})
         got = found.pieces[0].measured[:, 0]
         np.testing.assert_allclose(got - got[0], angle - angle[0], atol=TURN / 4096)
+    for bits in (16, 32):  # from near the end of its range, and not from turns away
+        raw = (np.round((angle - 7.0) * 2e3 / TURN).astype(np.int64)) % 2**bits
+        found = log(table(th=raw), units={"th": "counts/2000"})
+        np.testing.assert_allclose(found.pieces[0].measured[:, 0], angle - 7.0, atol=2e-3)
+        assert said(found, f"counter of {bits} bits")
     kept = log(table(th=counts), angles=["th"], units={"th": "counts/4096"})
     assert said(kept, "counts turns")
 

@@ -365,6 +365,20 @@ def test_bounds_hold_what_they_say_on_another_run(fitted: Fitted) -> None:
     np.testing.assert_array_equal(read_back.simulate(other)[0].lower, simulated.lower)
 
 
+@pytest.mark.parametrize("blocks", [1, 2, 5])
+def test_bounds_are_wide_where_predictions_diverge(fitted: Fitted, blocks: int) -> None:
+    """An endless error by an endless one that is expected is no number."""
+    found = pickle.loads(pickle.dumps(fitted))
+    vars(found).pop("_ratios", None)
+    for part in found._held_out["model"][:blocks]:
+        for errors in part.errors:
+            errors[len(errors) // 2 :] = np.inf
+    simulated = found.simulate(dopt.Log.for_plant(run(9, 300, drag=0.4), fitted.plant))[0]
+    assert (simulated.lower < simulated.upper).all()
+    assert found.coverage()["angle"] <= fitted.coverage()["angle"]
+    assert "angle" in found.report()
+
+
 def test_a_saved_model_needs_numpy_alone(fitted: Fitted, tmp_path: Path) -> None:
     fitted.save(tmp_path / "model_0.5s")  # no ending of a name is lost
     derivative, step = loaded(EXAMPLE / "load_model.py").load(tmp_path / "model_0.5s.npz")
@@ -608,6 +622,30 @@ def test_stamps_in_another_unit_are_refused() -> None:
     for scale in (1e3, 1e-3, 1e9):
         with pytest.raises(SpecificationError, match=r"the plant's dt of 0.02.*units={'time'"):
             dopt.fit(declared(), table.assign(time=scale * table.time), width=0)
+
+
+def test_what_never_changes_in_the_logs_is_said() -> None:
+    data = run(0, 420)
+    with pytest.raises(SpecificationError, match=r"nothing that was measured .angle. changes"):
+        dopt.fit(declared(), data.assign(angle=1.0), width=0)
+    found = dopt.fit(declared(), data.assign(voltage=0.0), width=0, window=0.4)
+    assert "voltage never changes in the logs" in found.report()
+
+
+def test_equations_that_nothing_follows_are_said() -> None:
+    """Two counters with zeros far apart: a stiff shaft between them led every state away."""
+    t, u = np.arange(400) * 0.02, np.random.default_rng(0).uniform(-2, 2, 400)
+    angle = np.cumsum(0.02 * u)
+    plant = pendulum(
+        states={"angle": "rad", "load": "rad", "rate": "rad/s"},
+        known={"angle": "rate", "load": "rate", "rate": "gain * voltage - 1e4 * (angle - load)"},
+        constants={"gain": dopt.unknown(1.0)},
+        angles=["angle", "load"],
+        measured={"angle": 0.01, "load": 0.01},
+    )
+    data = {"time": t, "voltage": u, "angle": angle, "load": angle + 3e6}
+    with pytest.raises(SpecificationError, match=r"no window of .* zeros of the measured states"):
+        dopt.fit(plant, data, width=0)
 
 
 def test_steps_that_are_too_long_are_said(fitted: Fitted) -> None:
