@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib.machinery import PathFinder
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Any, NoReturn, ParamSpec, TextIO
 
@@ -406,18 +407,13 @@ def hiding(text: str) -> str:
     Python finds a module in the folders of ``PYTHONPATH`` first. ``text`` is a traceback, which
     names the module or the file.
     """
-    for path in _before_the_standard_library():
-        name = path.parent.name if path.name == "__init__.py" else path.stem
-        if name in sys.stdlib_module_names and (str(path) in text or f"'{name}'" in text):
-            return f"{path} hides the module {name} of the standard library: rename this file."
+    library = str(Path(os.__file__).parent)
+    for folder in takewhile(lambda one: one != library, sys.path):
+        for path in (*Path(folder).glob("*.py"), *Path(folder).glob("*/__init__.py")):
+            name = path.parent.name if path.name == "__init__.py" else path.stem
+            if name in sys.stdlib_module_names and (str(path) in text or f"'{name}'" in text):
+                return f"{path} hides the module {name} of the standard library: rename this file."
     return ""
-
-
-def _before_the_standard_library() -> Iterator[Path]:
-    for folder in sys.path:
-        if folder == str(Path(os.__file__).parent):
-            return
-        yield from (*Path(folder).glob("*.py"), *Path(folder).glob("*/__init__.py"))
 
 
 @answered

@@ -171,11 +171,10 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
             "--shell-completion names no shell, but one is expected: write for instance "
             "--shell-completion install=bash."
         )
-    for name in ("config_dir", "config_path"):
-        folder, option = getattr(flags, name), f"--{name.replace('_', '-')}"
-        if folder and not Path(folder).is_dir():
+    for option, name in (("--config-dir", flags.config_dir), ("--config-path", flags.config_path)):
+        if name and not Path(name).is_dir():
             raise UsageError(
-                f"{option} is '{folder}', but a folder is expected: give one that exists."
+                f"{option} is '{name}', but a folder is expected: give one that exists."
             )
     if flags.config_path and not Path(flags.config_path).is_absolute():  # from Hydra's view
         raise UsageError(

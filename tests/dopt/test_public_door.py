@@ -15,7 +15,7 @@ import pytest
 import dopt
 from analysis.outputs import versions
 from dopt import process
-from dopt.errors import SpecificationError, _say_once, given_path, unknown_name
+from dopt.errors import SpecificationError, _say_once, counted, given_path, unknown_name
 from orchestrate.runner.saving import launch_record
 from tests.dopt.explorer.plants import MOTOR
 from tests.paths import ROOT, loaded_by, printed
@@ -93,6 +93,18 @@ def test_no_name_is_suggested_where_none_is_near(given: object) -> None:
     )
     nothing = str(unknown_name("field", "form", ()))
     assert nothing.endswith("is unknown, no field exists: remove it.")
+
+
+def test_the_nearest_name_counts_its_section_and_no_dashes() -> None:
+    assert "did you mean 'env.dt'" in str(unknown_name("setting", "dt", ("width", "env.dt")))
+    options = ("--json", "--until", "--timeout")
+    assert "unknown: choose one of" in str(unknown_name("option", "--for", options))
+    assert "did you mean '--timeout'" in str(unknown_name("option", "--time", options))
+
+
+@pytest.mark.parametrize(("number", "text"), [(0, "0 rows"), (1, "1 row"), (2000, "2,000 rows")])
+def test_one_thing_is_no_plural(number: int, text: str) -> None:
+    assert counted(number, "row") == text
 
 
 # Paths that users give, as one function reads them
