@@ -5,10 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import numpy as np
+import numpy.typing as npt
 
 from dopt.arguments import whole
 from dopt.systems.base import System
-from dopt.types import Array
+
+Array = npt.NDArray[np.float64]
 
 
 class TrialView(ABC):

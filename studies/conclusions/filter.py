@@ -122,7 +122,8 @@ def _intervals(run: KernelTrial, t: int) -> tuple[float, float, float]:
     within = np.abs(error) <= HALF_WIDTH * np.sqrt(np.diag(S))
     system, model = run.spec.system, run.spec.model
     truth = system.learned(x[None], t)
-    g = jacobian(run.spec, run.parameters, Samples(x[None], np.zeros((1, 1)), truth))[0]
+    sample = Samples(x[None], np.zeros((1, system.n_inputs)), truth)
+    g = jacobian(run.spec, run.parameters, sample)[0]
     variances = state.estimate.noise_variance[0] + np.diag(g @ inverse @ g.T)
     missed = model.predict(system, run.parameters, x[None]) - truth
     known = np.abs(missed[0]) <= HALF_WIDTH * np.sqrt(variances)

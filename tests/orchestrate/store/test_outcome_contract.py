@@ -51,7 +51,7 @@ def test_a_commit_gives_back_every_number_and_its_summary(db: Database) -> None:
     assert (row.status, row.n_steps, row.diverged_at) == ("done", HORIZON, None)
     assert (row.final_loss, row.best_loss) == (sent.final_loss, sent.best_loss)
     assert (row.wall_seconds, row.cpu_seconds) == (RUN.wall_seconds, RUN.cpu_seconds)
-    assert (row.peak_memory_bytes, row.node, row.launch) == (2**33, "here", db.launch)
+    assert (row.peak_memory_bytes, row.node, row.launch_id) == (2**33, "here", db.launch)
     assert db.rows("SELECT owner FROM trial") == [(None,)]
     assert db.rows("SELECT outcome, pid, started, launch_id FROM attempt") == [
         ("done", 18, "2126-01-31T12:00:00.000250Z", db.launch)
