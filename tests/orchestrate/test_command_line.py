@@ -84,6 +84,7 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "executor=ray", "launch.workers=1001"], "1,001 processes .* launch.workers"),
         (["launch.dryrun=true"], "did you mean 'dry_run'"),
         (["store.url="], "store.url is '', but a text is expected"),
+        (["store.url=mysql://you:secret@host/db"], "not supported"),
         (["store.url=postgresql://you:secret@host:port/db"], "The database URL cannot be read"),
         (["store.url=sqlite:////dev/null/results.db"], "cannot be made or opened"),
         (["store.url=sqlite://results/x.db"], "names a host, .* sqlite:///results/x.db"),

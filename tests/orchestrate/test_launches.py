@@ -137,7 +137,7 @@ def test_a_share_that_cannot_be_copied_is_kept(
 def test_a_share_is_copied_while_it_runs_and_goes_on_elsewhere(
     share: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    first, copy = share(EVERY="1", SEEDS="5000"), tmp_path / "shared/1-of-3.db"
+    first, copy = share(EVERY="3", SEEDS="5000"), tmp_path / "shared/1-of-3.db"
     until(lambda: copy.exists() and trials(f"sqlite:///{copy}"))
     first.terminate()  # as before the end of a job
     assert first.wait(PATIENCE_SECONDS) == ExitCode.INTERRUPTED
