@@ -142,7 +142,7 @@ def is_flag(values: pd.Series[Any]) -> bool:
 def is_text(values: pd.Series[Any]) -> bool:
     """Return whether a column has words, texts without a digit, or dates."""
     kinds, texts = r"\D*|\d{4}-\d\d-\d\d.*", values.dropna().astype(str)
-    return values.dtype.kind in "OT" and bool(texts.str.fullmatch(kinds).all())
+    return values.dtype.kind in ("O", "T") and bool(texts.str.fullmatch(kinds).all())
 
 
 def _guessed_inputs(table: pd.DataFrame) -> list[str]:
