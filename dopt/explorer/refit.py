@@ -146,7 +146,7 @@ def first_evidence() -> Request:
 def first_simulation() -> tuple[Plant, Log, int, int]:
     """Return a small fit: dx/dt = -a x + u."""
     u, fall = np.sign(np.sin(np.arange(150.0))), np.exp(-0.1 * np.arange(150.0))
-    x = np.convolve(u, 0.1 * fall)[:150]
+    x = np.append(0.0, np.convolve(u, (1.0 - fall[1]) * fall)[:149])
     plant = Plant(
         states={"x": "m"},
         inputs={"u": "m/s"},

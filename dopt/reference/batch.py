@@ -94,6 +94,8 @@ class BatchSteps:
         If the trials belong to different configurations.
     """
 
+    information_kind: ClassVar[type[BatchInformation]] = BatchInformation
+
     def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
         if len({spec.config_key for spec in specs}) != 1:
             raise SpecificationError(
@@ -153,8 +155,7 @@ class BatchSteps:
             self._sketch = torch.zeros(q, policy.sketch_size).to(self.theta)
             places = torch.tensor(buckets.astype(np.int64))
             self._sketch[torch.arange(q), places] = torch.tensor(signs).to(self.theta)
-        kind = TrialInformation if isinstance(self, NetworkSteps) else BatchInformation
-        self.information = kind(held.regularization, self.project(self.theta))
+        self.information = self.information_kind(held.regularization, self.project(self.theta))
 
     def project(self, rows: Tensor) -> Tensor:
         """Return gradients, (..., q), in the space of M, (..., s): as they are, or their sketch."""
@@ -455,6 +456,8 @@ class NetworkSteps(BatchSteps):
     They share the memory of the batch. An operation on a tensor of a few numbers costs several
     times that on an array.
     """
+
+    information_kind = TrialInformation
 
     def __init__(self, specs: Sequence[TrialSpec], device: str = "cpu") -> None:
         super().__init__(specs, device)

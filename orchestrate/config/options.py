@@ -345,11 +345,10 @@ class Sweeps:
     grids: list[dict[str, Any]] = field(default_factory=list)
 
 
+@functools.cache
 def register() -> None:
-    """Tell Hydra the options that are no files."""
+    """Tell Hydra, once in a process, the options that are no files."""
     store = ConfigStore.instance()
-    if hasattr(store, "__deepcopy__"):  # an earlier launch of this process has told it
-        return
     # Hydra copies the store, which nothing changes, with every source of every composition.
     setattr(store, "__deepcopy__", lambda _: store)  # noqa: B010  # mypy forbids the other way
     store.store(group="hydra/sweeper", name="grid", node=Sweeps)
